@@ -1,0 +1,39 @@
+# Everything runs in a virtual environment of its own, made on first use.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+WORKERS ?= 2
+
+.PHONY: help demo test test-slow lint clean
+
+help:
+	@echo "make demo       train PPO on bus14, evaluate it, write reports/demo (a few minutes)"
+	@echo "make test       linters, types, layers and the tests (under 12 minutes)"
+	@echo "make test-slow  the longer tests too"
+	@echo "make clean      remove the virtual environment and what was made"
+
+$(VENV)/.installed: pyproject.toml constraints.txt
+	@echo "== Creating the virtual environment $(VENV) and installing rl2grid (one to three minutes)"
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "rl2grid needs Python 3.11 or newer: set PYTHON=/path/to/python3.11."; exit 1; }
+	@$(PYTHON) -m venv $(VENV)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --progress-bar on --constraint constraints.txt --editable ".[train,analysis,dev]"
+	@touch $@
+
+demo: $(VENV)/.installed
+	@$(BIN)/rl2grid demo
+
+lint: $(VENV)/.installed
+	@echo "== Style, types and layers"
+	@$(BIN)/ruff check . && $(BIN)/ruff format --check .
+	@$(BIN)/mypy
+	@$(BIN)/lint-imports
+
+test: lint
+	@echo "== Tests"
+	@$(BIN)/python -m pytest -m "not slow" -n $(WORKERS) --dist worksteal
+
+test-slow: $(VENV)/.installed
+	@$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
+
+clean:
+	rm -rf $(VENV) reports runs .pytest_cache .mypy_cache .ruff_cache .import_linter_cache
