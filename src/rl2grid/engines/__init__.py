@@ -1,0 +1,1 @@
+"""The simulators that play the decision process."""

@@ -1,0 +1,258 @@
+"""Write the grid data of :mod:`rl2grid.grids` from live Grid2Op environments.
+
+``python -m rl2grid.engines.reference.extract`` rewrites ``src/rl2grid/grids/data/*.json``;
+``tests/grids/test_grid.py`` calls :func:`describe_environment` and compares.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where one base grid comes from; the first bundled name describes it.
+
+    The two mixes of bus118-M are one grid: they differ only in the maximum power of their renewables,
+    of which the grid takes the larger (mix x2.5), so that the series of both can be played on it.
+    """
+
+    grid2op_name: str
+    bundled_names: tuple[str, ...]
+    level_sizes: tuple[int, ...]
+
+
+SOURCES: dict[str, Source] = {
+    "bus14": Source(
+        "l2rpn_case14_sandbox",
+        ("l2rpn_case14_sandbox", "rte_case14_realistic", "rte_case14_redisp"),
+        (50, 209),
+    ),
+    "bus36-M": Source("l2rpn_wcci_2020", ("l2rpn_wcci_2020",), (50, 302, 1829, 11071, 66978)),
+    "bus36-MO-v0": Source(
+        "l2rpn_neurips_2020_track1_small", ("l2rpn_neurips_2020_track1",), (50, 302, 1829, 11071, 66978)
+    ),
+    "bus36-MO-v1": Source("l2rpn_icaps_2021_small", ("l2rpn_icaps_2021",), (50, 302, 1829, 11071, 66978)),
+    "bus118-M": Source(
+        "l2rpn_neurips_2020_track2_small",
+        ("l2rpn_neurips_2020_track2/x2.5", "l2rpn_neurips_2020_track2/x1"),
+        (50, 308, 1903, 11744, 72461),
+    ),
+    "bus118-MOB-v0": Source("l2rpn_wcci_2022", ("l2rpn_wcci_2022_dev",), (50, 309, 1914, 11849, 73328)),
+    "bus118-MOB-v1": Source("l2rpn_idf_2023", ("l2rpn_idf_2023",), (50, 309, 1915, 11852, 73357)),
+}
+
+_BUS14_MAINTENANCE_LINES: tuple[int, ...] = ()
+"""Lines of bus14 that are maintained: Table 1 of the paper gives bus14 maintenance, the wheel none."""
+
+_VECTORS = (
+    "sub_info",
+    "line_or_to_subid",
+    "line_ex_to_subid",
+    "gen_to_subid",
+    "load_to_subid",
+    "storage_to_subid",
+    "line_or_pos_topo_vect",
+    "line_ex_pos_topo_vect",
+    "gen_pos_topo_vect",
+    "load_pos_topo_vect",
+    "storage_pos_topo_vect",
+    "gen_type",
+    "gen_pmin",
+    "gen_pmax",
+    "gen_max_ramp_up",
+    "gen_max_ramp_down",
+    "gen_redispatchable",
+    "gen_renewable",
+)
+_STORAGE_VECTORS = {
+    "storage_emax": "storage_Emax",
+    "storage_emin": "storage_Emin",
+    "storage_max_p_prod": "storage_max_p_prod",
+    "storage_max_p_absorb": "storage_max_p_absorb",
+    "storage_charging_efficiency": "storage_charging_efficiency",
+    "storage_discharging_efficiency": "storage_discharging_efficiency",
+    "storage_loss": "storage_loss",
+}
+_NAMES = ("name_sub", "name_line", "name_gen", "name_load", "name_storage")
+
+
+def make_environment(bundled_name: str) -> Any:
+    """The Grid2Op environment ``name`` or mix ``name/mix`` of the wheel, with LightSim2Grid."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    import grid2op
+    from lightsim2grid import LightSimBackend
+
+    # The folder itself: a mix taken out of its multimix is closed together with it.
+    folder = Path(grid2op.__file__).parent / "data" / bundled_name
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return grid2op.make(str(folder), backend=LightSimBackend())
+
+
+def describe_environment(grid_id: str) -> dict[str, Any]:
+    """Everything that :class:`rl2grid.grids.Grid` holds, read from the live environment."""
+    source = SOURCES[grid_id]
+    environments = [make_environment(name) for name in source.bundled_names if not name.startswith("rte_")]
+    environment = environments[0]
+    record: dict[str, Any] = {
+        "id": grid_id,
+        "grid2op_name": source.grid2op_name,
+        "bundled_names": source.bundled_names,
+        "level_sizes": source.level_sizes,
+        "rules": _rules(environment),
+        "opponent": _opponent(environment),
+        "maintenance": _maintenance(grid_id, environment),
+        "layout": [[float(x) for x in environment.grid_layout[name]] for name in environment.name_sub],
+        "sub_area": _areas(environment),
+        "thermal_limit": environment.get_thermal_limit(),
+        "slack_gen": _slack_generator(environment),
+        "load_p_max": np.max([_load_p_max(each) for each in environments], axis=0),
+    }
+    for name in (*_NAMES, *_VECTORS):
+        record[name] = getattr(environment, name)
+    record["gen_cost_per_mw"] = environment.gen_cost_per_MW
+    for name, attribute in _STORAGE_VECTORS.items():
+        record[name] = getattr(environment, attribute) if environment.n_storage else []
+    if not environment.n_storage:
+        record |= {"name_storage": [], "storage_to_subid": [], "storage_pos_topo_vect": []}
+    plain: dict[str, Any] = json.loads(json.dumps(record, default=_plain))
+    return plain
+
+
+def _rules(environment: Any) -> dict[str, Any]:
+    parameters = environment.parameters
+    return {
+        "cooldown_line": parameters.NB_TIMESTEP_COOLDOWN_LINE,
+        "cooldown_sub": parameters.NB_TIMESTEP_COOLDOWN_SUB,
+        "reconnection": parameters.NB_TIMESTEP_RECONNECTION,
+        "overflow_allowed": parameters.NB_TIMESTEP_OVERFLOW_ALLOWED,
+        "hard_overflow": float(parameters.HARD_OVERFLOW_THRESHOLD),
+        "max_line_changes": parameters.MAX_LINE_STATUS_CHANGED,
+        "max_sub_changes": parameters.MAX_SUB_CHANGED,
+    }
+
+
+def _opponent(environment: Any) -> dict[str, Any]:
+    space = environment._oppSpace
+    opponent = space.opponent
+    kind = {
+        "WeightedRandomOpponent": "weighted",
+        "GeometricOpponent": "geometric",
+        "GeometricOpponentMultiArea": "multi_area",
+    }.get(type(opponent).__name__, "none")
+    if kind == "none":
+        return {"kind": "none"}
+    areas = opponent.list_opponents if kind == "multi_area" else [opponent]
+    record: dict[str, Any] = {
+        "kind": kind,
+        "areas": [area._lines_ids for area in areas],
+        "max_duration": int(space.attack_max_duration),
+        "cooldown": int(space.attack_cooldown),
+        "initial_budget": float(space.init_budget),
+        "budget_per_step": float(space.budget_per_timestep),
+    }
+    if kind == "weighted":
+        return record | {
+            "rho_normalization": opponent._rho_normalization,
+            "attack_period": int(opponent._attack_period),
+        }
+    return record | {
+        "hazard_rate": float(areas[0]._attack_hazard_rate),
+        "recovery_rate": float(areas[0]._recovery_rate),
+        "minimum_duration": int(areas[0]._recovery_minimum_duration),
+        "pmax_pmin_ratio": float(areas[0]._pmax_pmin_ratio),
+    }
+
+
+def _maintenance(grid_id: str, environment: Any) -> dict[str, Any]:
+    if grid_id == "bus14":
+        return {
+            "lines": _BUS14_MAINTENANCE_LINES,
+            "monthly_daily_probability": [0.02] * 12,
+            "monthly_max_per_day": [1] * 12,
+            "start_hour": 9,
+            "end_hour": 17,
+        }
+    environment.reset()
+    data = environment.chronics_handler.real_data.data
+    lines = getattr(data, "line_to_maintenance", None)
+    if not lines:
+        return {
+            "lines": [],
+            "monthly_daily_probability": [0.0] * 12,
+            "monthly_max_per_day": [0] * 12,
+            "start_hour": 9,
+            "end_hour": 17,
+        }
+    return {
+        "lines": sorted(environment.name_line.tolist().index(name) for name in lines),
+        "monthly_daily_probability": data.daily_proba_per_month_maintenance,
+        "monthly_max_per_day": data.max_daily_number_per_month_maintenance,
+        "start_hour": data.maintenance_starting_hour,
+        "end_hour": data.maintenance_ending_hour,
+    }
+
+
+def _areas(environment: Any) -> list[int]:
+    rules = environment._game_rules.legal_action
+    by_area = getattr(rules, "substations_id_by_area", None)
+    areas = [0] * environment.n_sub
+    for area, substations in (by_area or {}).items():
+        for substation in substations:
+            areas[substation] = int(area)
+    return areas
+
+
+def _slack_generator(environment: Any) -> int:
+    generators = environment.backend._grid.get_generators()
+    return next(i for i, generator in enumerate(generators) if generator.is_slack)
+
+
+def _load_p_max(environment: Any) -> Any:
+    largest = np.zeros(environment.n_load, np.float32)
+    for index in range(len(environment.chronics_handler.subpaths)):
+        environment.set_id(index)
+        environment.reset()
+        largest = np.maximum(largest, environment.chronics_handler.real_data.data.load_p.max(axis=0))
+    return largest
+
+
+def _plain(value: Any) -> Any:
+    """NumPy values as JSON; float32 by its shortest decimal, which reads back to the same float32."""
+    if isinstance(value, np.ndarray):
+        if value.dtype == np.float32:
+            return [float(str(item)) for item in value]
+        return value.tolist()
+    if isinstance(value, np.floating):
+        return float(str(value))
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"{type(value).__name__} cannot be written to the grid data.")
+
+
+def main() -> None:
+    """Rewrite the grid data."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument(
+        "--output", type=Path, default=Path(__file__).parents[2] / "grids" / "data", help="folder of the JSON files"
+    )
+    output: Path = parser.parse_args().output
+    output.mkdir(parents=True, exist_ok=True)
+    for grid_id in SOURCES:
+        record = describe_environment(grid_id)
+        lines = ",\n".join(f" {json.dumps(key)}: {json.dumps(value)}" for key, value in record.items())
+        (output / f"{grid_id}.json").write_text("{\n" + lines + "\n}\n")
+        print(f"{grid_id}: {len(record['name_line'])} lines, opponent {record['opponent']['kind']}")
+
+
+if __name__ == "__main__":
+    main()

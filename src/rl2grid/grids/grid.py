@@ -1,0 +1,246 @@
+"""The seven base grids as immutable data (paper, Table 1), read without Grid2Op.
+
+The files under ``data/`` are written by ``python -m rl2grid.engines.reference.extract`` from live
+Grid2Op environments and compared with them by ``tests/grids/test_grid.py``.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+from dataclasses import dataclass, fields
+from importlib import resources
+from typing import Any, get_type_hints
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rl2grid.errors import one_of
+
+GRID_IDS: tuple[str, ...] = (
+    "bus14",
+    "bus36-M",
+    "bus36-MO-v0",
+    "bus36-MO-v1",
+    "bus118-M",
+    "bus118-MOB-v0",
+    "bus118-MOB-v1",
+)
+"""Every base grid, in the order of the paper's Table 1."""
+
+STEPS_PER_HOUR = 12
+"""All grids play 5-minute steps."""
+
+Ints = NDArray[np.int32]
+Floats = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+_DTYPES: dict[Any, type] = {Ints: np.int32, Floats: np.float32, Bools: np.bool_}
+
+
+@dataclass(frozen=True)
+class Rules:
+    """Operating rules of a grid (``grid2op.Parameters`` and ``gamerules``)."""
+
+    cooldown_line: int
+    """Steps during which a line cannot be switched again (``NB_TIMESTEP_COOLDOWN_LINE``)."""
+    cooldown_sub: int
+    """Steps during which a substation cannot be changed again (``NB_TIMESTEP_COOLDOWN_SUB``)."""
+    reconnection: int
+    """Steps before a line tripped by a protection may be reconnected (``NB_TIMESTEP_RECONNECTION``)."""
+    overflow_allowed: int
+    """Overloaded steps a line survives (``NB_TIMESTEP_OVERFLOW_ALLOWED``)."""
+    hard_overflow: float
+    """Loading above which a line trips at once (``HARD_OVERFLOW_THRESHOLD``)."""
+    max_line_changes: int
+    """Lines one action may switch, per area (``MAX_LINE_STATUS_CHANGED``)."""
+    max_sub_changes: int
+    """Substations one action may change, per area (``MAX_SUB_CHANGED``)."""
+
+
+@dataclass(frozen=True)
+class OpponentConfig:
+    """The attacker of a grid (``grid2op.Opponent``); see :mod:`rl2grid.mdp.opponents`."""
+
+    kind: str
+    """``none``, ``weighted`` (WeightedRandomOpponent), ``geometric`` (GeometricOpponent) or
+    ``multi_area`` (GeometricOpponentMultiArea)."""
+    areas: tuple[tuple[int, ...], ...] = ()
+    """Line ids that may be attacked; one tuple per area (one area unless ``multi_area``)."""
+    rho_normalization: tuple[float, ...] = ()
+    """``weighted`` only: usual loading of each attackable line."""
+    max_duration: int = 0
+    """Longest attack accepted, steps (``opponent_attack_duration``)."""
+    cooldown: int = 0
+    """Steps between attacks (``opponent_attack_cooldown``)."""
+    initial_budget: float = 0.0
+    budget_per_step: float = 0.0
+    attack_period: int = 0
+    """``weighted`` only: an attack falls uniformly in the next ``attack_period`` steps."""
+    hazard_rate: float = 0.0
+    """``geometric`` and ``multi_area``: chance per step that an attack begins."""
+    recovery_rate: float = 0.0
+    """``geometric`` and ``multi_area``: chance per step that an attack ends."""
+    minimum_duration: int = 0
+    """``geometric`` and ``multi_area``: steps an attack lasts at least."""
+    pmax_pmin_ratio: float = 0.0
+    """``geometric`` and ``multi_area``: odds of the most against the least loaded line."""
+
+
+@dataclass(frozen=True)
+class MaintenanceConfig:
+    """How planned maintenance is sampled where a series records none."""
+
+    lines: tuple[int, ...]
+    """Line ids that may be maintained; empty where every bundled series records its own."""
+    monthly_daily_probability: tuple[float, ...]
+    """January to December: probability of maintenance per line and working day."""
+    monthly_max_per_day: tuple[int, ...]
+    """January to December: most lines maintained on one day."""
+    start_hour: int
+    """Maintenance begins at this hour."""
+    end_hour: int
+    """Maintenance ends at this hour."""
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """One base grid: names, connections, limits, costs and rules.
+
+    Attribute names are Grid2Op's. Powers are in MW, energies in MWh, currents in A. The topology
+    vector (``topo_vect``) has :attr:`dim_topo` entries, substation after substation.
+    """
+
+    id: str
+    grid2op_name: str
+    """Name of the full dataset."""
+    bundled_names: tuple[str, ...]
+    """Names of the environments inside the Grid2Op wheel (``name`` or ``name/mix``)."""
+    level_sizes: tuple[int, ...]
+    """Number of discrete actions per difficulty level (paper, Table 4)."""
+    rules: Rules
+    opponent: OpponentConfig
+    maintenance: MaintenanceConfig
+
+    name_sub: tuple[str, ...]
+    name_line: tuple[str, ...]
+    name_gen: tuple[str, ...]
+    name_load: tuple[str, ...]
+    name_storage: tuple[str, ...]
+    layout: tuple[tuple[float, float], ...]
+    """Position of each substation on a drawing."""
+    sub_area: Ints
+    """Area of each substation (``RulesByArea``); all zero elsewhere."""
+    sub_info: Ints
+    """Number of elements connected to each substation."""
+
+    line_or_to_subid: Ints
+    line_ex_to_subid: Ints
+    gen_to_subid: Ints
+    load_to_subid: Ints
+    storage_to_subid: Ints
+    line_or_pos_topo_vect: Ints
+    line_ex_pos_topo_vect: Ints
+    gen_pos_topo_vect: Ints
+    load_pos_topo_vect: Ints
+    storage_pos_topo_vect: Ints
+
+    thermal_limit: Floats
+    """Permanent current limit at the origin of each line, A."""
+    gen_type: tuple[str, ...]
+    gen_pmin: Floats
+    gen_pmax: Floats
+    gen_max_ramp_up: Floats
+    """MW per step."""
+    gen_max_ramp_down: Floats
+    gen_redispatchable: Bools
+    gen_renewable: Bools
+    gen_cost_per_mw: Floats
+    """Cost per MWh."""
+    slack_gen: int
+    """The generator that balances the power flow."""
+    storage_emax: Floats
+    storage_emin: Floats
+    storage_max_p_prod: Floats
+    storage_max_p_absorb: Floats
+    storage_charging_efficiency: Floats
+    storage_discharging_efficiency: Floats
+    storage_loss: Floats
+    load_p_max: Floats
+    """Largest demand of each load in the bundled series, MW (used to scale observations)."""
+
+    @property
+    def n_sub(self) -> int:
+        return len(self.name_sub)
+
+    @property
+    def n_line(self) -> int:
+        return len(self.name_line)
+
+    @property
+    def n_gen(self) -> int:
+        return len(self.name_gen)
+
+    @property
+    def n_load(self) -> int:
+        return len(self.name_load)
+
+    @property
+    def n_storage(self) -> int:
+        return len(self.name_storage)
+
+    @property
+    def dim_topo(self) -> int:
+        return int(self.sub_info.sum())
+
+    @functools.cached_property
+    def sub_first_element(self) -> Ints:
+        """Position in the topology vector of the first element of each substation."""
+        return np.concatenate(([0], np.cumsum(self.sub_info)[:-1])).astype(np.int32)
+
+    @functools.cached_property
+    def element_to_subid(self) -> Ints:
+        """Substation of each entry of the topology vector."""
+        return np.repeat(np.arange(self.n_sub, dtype=np.int32), self.sub_info)
+
+    @functools.cached_property
+    def hash(self) -> str:
+        """Short hash of everything that defines the grid."""
+        return hashlib.sha256(_file_bytes(self.id)).hexdigest()[:16]
+
+
+def load_grid(grid_id: str) -> Grid:
+    """The grid called ``grid_id``.
+
+    Raises:
+        UsageError: ``grid_id`` is not one of :data:`GRID_IDS`.
+    """
+    if grid_id not in GRID_IDS:
+        raise one_of("Grid", grid_id, GRID_IDS)
+    return _load(grid_id)
+
+
+@functools.cache
+def _load(grid_id: str) -> Grid:
+    record = json.loads(_file_bytes(grid_id))
+    hints = get_type_hints(Grid)
+    values: dict[str, Any] = {}
+    for field in fields(Grid):
+        value, hint = record[field.name], hints[field.name]
+        if hint in _DTYPES:
+            value = np.array(value, dtype=_DTYPES[hint])
+            value.setflags(write=False)
+        elif hint in (Rules, OpponentConfig, MaintenanceConfig):
+            value = hint(**{key: _tuples(item) for key, item in value.items()})
+        else:
+            value = _tuples(value)
+        values[field.name] = value
+    return Grid(**values)
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
+
+
+def _file_bytes(grid_id: str) -> bytes:
+    return (resources.files("rl2grid.grids") / "data" / f"{grid_id}.json").read_bytes()
