@@ -1,0 +1,1 @@
+"""The Markov decision process, written once for every engine."""

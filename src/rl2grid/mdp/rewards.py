@@ -1,0 +1,226 @@
+r"""Rewards of a grid step: presets, weights on the default components, or a compiled function of your own.
+
+A reward is ``weights . (survive, overload, cost)`` (paper, Section 3.1). With L the lines, ``rho`` the
+loading of a line, ``losses = sum(gen_p) - sum(load_p)``, ``c`` the cost per MWh of the dearest generator that
+produces now and ``c_max`` that of the grid's dearest:
+
+``default`` (weights 1, 0.5, 0.5) is never negative, so that staying alive is never punished. The printed
+formula has the sign of an overload the wrong way round and names no normalisers; here
+
+- survive = 1
+- overload = -mean over L of (clip(rho - 1, 0, 1) if connected else 1)
+- cost = -clip(c (losses' + sum|actual_dispatch| + sum|storage_power| + curtailed) / (0.1 c_max sum(gen_pmax)), 0, 1),
+  where losses' = max(losses - sum(storage_power), 0) (what a storage unit absorbs is not lost) and
+  curtailed = sum over renewables of max(gen_p_before_curtail - gen_p, 0)
+- all are 0 at a game over
+
+``paper`` (weights 1, 0.5, 0.5: its appendix) is the printed formula, the excess counted negative and
+every term clipped to the range that the paper states. As sums over the grid and costs in MW are far
+larger than those ranges, both terms are saturated most of the time:
+
+- survive = t / T
+- overload = clip(-sum over L of (max(rho - 1, 0) if connected else 1), -1, 1)
+- cost = clip(-c (losses + sum|actual_dispatch| + sum|storage_power|), -1, 0)
+- all are 0 at a game over
+
+``released`` (weights 1, 1, 0.5) is what the paper's released code trains with:
+
+- survive = 1; -5 at a game over
+- overload = -sum over L of (max(rho - 1, 0) if connected else 1) / (0.1 \|L\|); -5 at a game over and after an
+  illegal or ambiguous action
+- cost = -c (losses + 5 sum|actual_dispatch| + sum|storage_power|) / (5.05 c_max sum(gen_pmax)): Grid2Op's
+  ``RedispReward`` divided by its largest regret; -1 at a game over and after an illegal or ambiguous action
+
+A function of your own is compiled with ``numba.njit``, reads row ``i`` of a
+:class:`~rl2grid.mdp.state.GridState` and returns the three components, which are added up as they are::
+
+    @numba.njit
+    def fewer_switches(state, i):
+        return 1.0, 0.0, -0.01 * np.sum(state.topo_vect[i] != 1)
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numba
+import numpy as np
+
+from rl2grid.compile import jit
+from rl2grid.errors import UsageError
+from rl2grid.mdp.state import F32, Flags, GridState
+
+Components = tuple[float, float, float]
+"""survive, overload, cost."""
+
+
+@dataclass(frozen=True)
+class RewardFunction:
+    """A reward, ready to be evaluated after every grid step."""
+
+    name: str
+    components: Callable[[GridState, int], Components]
+    """Compiled ``(state, i) -> (survive, overload, cost)``."""
+    weights: Components
+    """Weights of the three components in the reward."""
+
+
+@jit
+def default_components(state: GridState, i: int) -> Components:
+    """Components of the ``default`` reward in row ``i``: 1, and two in [-1, 0]; see the module."""
+    if state.terminated[i]:
+        return 0.0, 0.0, 0.0
+    stored = _total(state.storage_power[i])
+    power = max(_total(state.gen_p[i]) - _total(state.load_p[i]) - stored, 0.0)
+    power += _magnitude(state.actual_dispatch[i]) + _magnitude(state.storage_power[i])
+    power += _curtailed(state.gen_p_before_curtail[i], state.gen_p[i])
+    largest = 0.1 * _dearest(state.gen_cost_per_mw) * _total(state.gen_pmax)
+    cost = 0.0 - min(max(_marginal_cost(state.gen_p[i], state.gen_cost_per_mw) * power / largest, 0.0), 1.0)
+    return 1.0, overload_component(state, i), cost
+
+
+@jit
+def overload_component(state: GridState, i: int) -> float:
+    """Overload of the ``default`` reward in row ``i``, in [-1, 0]; 0 at a game over."""
+    if state.terminated[i]:
+        return 0.0
+    total = 0.0
+    n_lines: int = state.rho.shape[1]
+    for line in range(n_lines):
+        excess = np.float64(state.rho[i, line]) - 1.0
+        total -= min(max(excess, 0.0), 1.0) if state.line_status[i, line] else 1.0
+    return total / n_lines
+
+
+@jit
+def paper_components(state: GridState, i: int) -> Components:
+    """Components of the ``paper`` reward in row ``i``: in [0, 1], [-1, 1] and [-1, 0]; see the module."""
+    if state.terminated[i]:
+        return 0.0, 0.0, 0.0
+    survive = np.float64(state.step[i]) / np.float64(state.episode_length[i])
+    overload = max(0.0 - _overloads_and_outages(state.rho[i], state.line_status[i]), -1.0)
+    power = _total(state.gen_p[i]) - _total(state.load_p[i])
+    power += _magnitude(state.actual_dispatch[i]) + _magnitude(state.storage_power[i])
+    cost = min(max(0.0 - _marginal_cost(state.gen_p[i], state.gen_cost_per_mw) * power, -1.0), 0.0)
+    return survive, overload, cost
+
+
+@jit
+def released_components(state: GridState, i: int) -> Components:
+    """Components of the ``released`` reward in row ``i``, the latter two unbounded below; see the module."""
+    if state.terminated[i]:
+        return -5.0, -5.0, -1.0
+    if state.illegal[i] or state.ambiguous[i]:
+        return 1.0, -5.0, -1.0
+    overload = 0.0 - _overloads_and_outages(state.rho[i], state.line_status[i]) / (0.1 * state.rho.shape[1])
+    regret = _total(state.gen_p[i]) - _total(state.load_p[i]) + _magnitude(state.storage_power[i])
+    regret += 5.0 * _magnitude(state.actual_dispatch[i])
+    largest = 5.05 * _dearest(state.gen_cost_per_mw) * _total(state.gen_pmax)
+    return 1.0, overload, 0.0 - _marginal_cost(state.gen_p[i], state.gen_cost_per_mw) * regret / largest
+
+
+PRESETS: dict[str, RewardFunction] = {
+    "default": RewardFunction("default", default_components, (1.0, 0.5, 0.5)),
+    "paper": RewardFunction("paper", paper_components, (1.0, 0.5, 0.5)),
+    "released": RewardFunction("released", released_components, (1.0, 1.0, 0.5)),
+}
+
+
+def resolve_reward(spec: str | Sequence[float] | Callable[..., Any]) -> RewardFunction:
+    """The reward that ``spec`` asks for.
+
+    Args:
+        spec: a name in :data:`PRESETS`; or the weights of the three default components; or a function
+            ``(state, i) -> (survive, overload, cost)`` compiled with ``numba.njit``, whose components are added up.
+
+    Raises:
+        UsageError: ``spec`` is none of these.
+    """
+    if isinstance(spec, str) and spec in PRESETS:
+        return PRESETS[spec]
+    if callable(spec):
+        return _custom(spec)
+    weights = _weights(spec)
+    return RewardFunction(f"weights {', '.join(f'{weight:g}' for weight in weights)}", default_components, weights)
+
+
+def _custom(function: Callable[..., Any]) -> RewardFunction:
+    name = getattr(function, "__name__", type(function).__name__)
+    compiled = numba.extending.is_jitted(function) or numba.config.DISABLE_JIT
+    source = getattr(function, "py_func", function)
+    if not compiled or len(inspect.signature(source).parameters) != 2:
+        raise UsageError(
+            f"Reward function {name!r} is not usable: compile a function (state, i) -> (survive, overload, cost) "
+            f"with numba.njit, or choose one of {', '.join(PRESETS)}."
+        )
+    return RewardFunction(name, function, (1.0, 1.0, 1.0))
+
+
+def _weights(spec: object) -> Components:
+    numbers = spec if isinstance(spec, Sequence | np.ndarray) and not isinstance(spec, str) else ()
+    valid = [float(x) for x in numbers if isinstance(x, int | float | np.number) and not isinstance(x, bool)]
+    if len(numbers) != 3 or len(valid) != 3 or not all(map(math.isfinite, valid)):
+        raise UsageError(
+            f"Reward {spec!r} does not exist: choose one of {', '.join(PRESETS)}, three finite weights of the default "
+            "components, or a function compiled with numba.njit."
+        )
+    return valid[0], valid[1], valid[2]
+
+
+@jit
+def _overloads_and_outages(rho: F32, line_status: Flags) -> float:
+    """Excess loading of connected lines plus number of disconnected ones."""
+    total = 0.0
+    for line in range(rho.shape[0]):
+        if line_status[line]:
+            total += max(np.float64(rho[line]) - 1.0, 0.0)
+        else:
+            total += 1.0
+    return total
+
+
+@jit
+def _curtailed(gen_p_before_curtail: F32, gen_p: F32) -> float:
+    """MW that renewables would produce more without their limits (other generators have 0 before)."""
+    total = 0.0
+    for gen in range(gen_p.shape[0]):
+        total += max(np.float64(gen_p_before_curtail[gen]) - np.float64(gen_p[gen]), 0.0)
+    return total
+
+
+@jit
+def _marginal_cost(gen_p: F32, gen_cost_per_mw: F32) -> float:
+    """Cost per MWh of the dearest generator that produces now; 0 when none does."""
+    dearest = 0.0
+    for gen in range(gen_p.shape[0]):
+        if gen_p[gen] > 0:
+            dearest = max(dearest, np.float64(gen_cost_per_mw[gen]))
+    return dearest
+
+
+@jit
+def _dearest(gen_cost_per_mw: F32) -> float:
+    dearest = 0.0
+    for gen in range(gen_cost_per_mw.shape[0]):
+        dearest = max(dearest, np.float64(gen_cost_per_mw[gen]))
+    return dearest
+
+
+@jit
+def _total(powers: F32) -> float:
+    total = 0.0
+    for k in range(powers.shape[0]):
+        total += np.float64(powers[k])
+    return total
+
+
+@jit
+def _magnitude(powers: F32) -> float:
+    total = 0.0
+    for k in range(powers.shape[0]):
+        total += abs(np.float64(powers[k]))
+    return total
