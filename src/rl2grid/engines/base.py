@@ -1,0 +1,43 @@
+"""What every engine offers: environments of one grid, advanced one grid step at a time."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from rl2grid.grids import Grid
+from rl2grid.mdp.actions import StepAction
+from rl2grid.mdp.state import GridState
+from rl2grid.scenarios.episodes import EpisodePlan
+
+DISPATCHES: tuple[str, ...] = ("exact", "grid2op")
+"""How the redispatch problem of a step is solved; see ``docs/dispatch.md``."""
+
+
+class Engine(Protocol):
+    """Simulator of several independent environments of one grid.
+
+    An engine fills the observed attributes and the flags of its :class:`~rl2grid.mdp.state.GridState`.
+    It knows nothing of rewards, costs and heuristics: :mod:`rl2grid.engines.transition` adds them.
+    """
+
+    grid: Grid
+    state: GridState
+
+    def reset(self, i: int, plan: EpisodePlan) -> None:
+        """Begin the episode ``plan`` in environment ``i``; its first row may already be a game over."""
+
+    def step(self, i: int, action: StepAction) -> None:
+        """Play one grid step of environment ``i``."""
+
+    def simulate(self, i: int, action: StepAction, horizon: int) -> GridState:
+        """Play ``action`` on the forecast ``horizon`` steps ahead, leaving environment ``i`` untouched.
+
+        Returns:
+            A state of one environment (row 0), valid until the next call.
+
+        Raises:
+            UsageError: the scenario has no forecast for that horizon.
+        """
+
+    def close(self) -> None:
+        """Free what the engine holds."""

@@ -1,0 +1,256 @@
+"""The reference engine: Grid2Op with the LightSim2Grid power flow, slow and trusted.
+
+Grid2Op plays the steps. We replace its file reading (:mod:`.chronics`), its opponent's random draws
+(:mod:`.opponent`) and, with ``dispatch="exact"``, its redispatch solver (:mod:`.dispatch`).
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rl2grid.engines.base import DISPATCHES
+from rl2grid.errors import UsageError, one_of
+from rl2grid.grids import Grid
+from rl2grid.mdp.actions import ActionKind, StepAction, decode_continuous, moved_elements
+from rl2grid.mdp.opponents import draw_opponent, load_draws, new_opponent_state
+from rl2grid.mdp.state import GridState, new_state
+from rl2grid.mdp.termination import GameOver, game_over_reason
+from rl2grid.scenarios.episodes import EpisodePlan, maintenance_matrix
+from rl2grid.scenarios.library import list_scenarios, load_scenario
+from rl2grid.streams import Purpose, Stream
+
+# Grid2Op's redispatch solver slows down sixfold on contended BLAS threads.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import grid2op
+from grid2op.Action import PlayableAction
+from grid2op.Exceptions import Grid2OpException, ImpossibleRedispatching, NoForecastAvailable
+from grid2op.Observation import CompleteObservation
+from grid2op.Reward import ConstantReward
+from lightsim2grid import LightSimBackend
+
+from rl2grid.engines.reference.chronics import ScenarioChronics
+from rl2grid.engines.reference.dispatch import ExactRedispatchSolver, redispatch_is_impossible
+from rl2grid.engines.reference.opponent import install_opponent
+
+_OBSERVED = (
+    "gen_p",
+    "gen_theta",
+    "load_p",
+    "load_theta",
+    "p_or",
+    "a_or",
+    "rho",
+    "line_status",
+    "topo_vect",
+    "timestep_overflow",
+    "time_before_cooldown_line",
+    "time_before_cooldown_sub",
+    "time_next_maintenance",
+    "duration_next_maintenance",
+    "target_dispatch",
+    "actual_dispatch",
+    "gen_margin_up",
+    "gen_margin_down",
+    "gen_p_before_curtail",
+    "curtailment",
+    "curtailment_limit",
+)
+_OBSERVED_STORAGE = ("storage_charge", "storage_power_target", "storage_power", "storage_theta")
+
+
+class ReferenceEngine:
+    """``n`` Grid2Op environments of one grid; see :class:`rl2grid.engines.base.Engine`."""
+
+    def __init__(self, grid: Grid, n: int, dispatch: str = "exact", opponent: bool = True) -> None:
+        if dispatch not in DISPATCHES:
+            raise one_of("Dispatch", dispatch, DISPATCHES)
+        self.grid = grid
+        self.state = new_state(grid, n)
+        self._simulated = new_state(grid, 1)
+        self._dispatch = dispatch
+        self._opponent = new_opponent_state(grid, n) if opponent and grid.opponent.kind != "none" else None
+        self._environments = self._make_environments(n)
+        self._do_nothing = [environment.action_space() for environment in self._environments]
+        self._observations: list[Any] = [None] * n
+        self._observed = (*_OBSERVED, *_OBSERVED_STORAGE) if grid.n_storage else _OBSERVED
+
+    def reset(self, i: int, plan: EpisodePlan) -> None:
+        """Begin the episode ``plan`` in environment ``i``."""
+        environment = self._environments[i]
+        scenario = load_scenario(self.grid.id, plan.scenario_id)
+        maintenance = maintenance_matrix(self.grid, scenario, plan)
+        environment.chronics_handler.real_data.play(scenario, plan.start, plan.n_steps, maintenance)
+        if self._opponent is not None:
+            stream = Stream(plan.seed, plan.number, Purpose.OPPONENT)
+            load_draws(self._opponent, i, draw_opponent(self.grid, stream, plan.n_steps))
+        self._clear_flags(i, plan)
+        try:
+            self._observations[i] = environment.reset()
+        except Grid2OpException as error:
+            # Row 0 collapses; the exception holds what Grid2Op's step knew.
+            self._read_game_over(self.state, i, environment, [error])
+            return
+        self._read(self.state, i, self._observations[i])
+
+    def step(self, i: int, action: StepAction) -> None:
+        """Play one Grid2Op step of environment ``i``."""
+        state, environment = self.state, self._environments[i]
+        impossible = self._is_impossible(i, action)
+        played = self._do_nothing[i] if impossible else self._grid2op_action(i, action)
+        observation, _, done, info = environment.step(played)
+        state.step[i] += 1
+        state.illegal[i] = info["is_illegal"] or info["failed_redispatching"] or impossible
+        state.ambiguous[i] = info["is_ambiguous"]
+        self._observations[i] = observation
+        if self._opponent is not None:
+            state.attacked[i] = self._opponent.attacked[i]
+        if done and observation.topo_vect.max() < 0:
+            self._read_game_over(state, i, environment, info["exception"])
+            return
+        self._read(state, i, observation)
+        state.truncated[i] = done
+
+    def simulate(self, i: int, action: StepAction, horizon: int) -> GridState:
+        """``obs.simulate`` of Grid2Op; what it does is described in ``docs/simulate.md``."""
+        observation, result = self._observations[i], self._simulated
+        if self.state.terminated[i] or observation is None:
+            raise UsageError("Nothing can be simulated after a game over: reset the environment first.")
+        impossible = self._is_impossible(i, action)
+        played = self._do_nothing[i] if impossible else self._grid2op_action(i, action)
+        try:
+            simulated, _, _, info = observation.simulate(played, time_step=horizon)
+        except NoForecastAvailable:
+            raise UsageError(
+                f"Scenario {observation._obs_env.chronics_handler.get_id()!r} has no forecast {horizon} steps ahead."
+            ) from None
+        _copy_episode(self.state, i, result, horizon)
+        result.illegal[0] = info["is_illegal"] or info["failed_redispatching"] or impossible
+        result.ambiguous[0] = info["is_ambiguous"]
+        if simulated.topo_vect.max() < 0:
+            self._read_game_over(result, 0, observation._obs_env, info["exception"])
+        else:
+            self._read(result, 0, simulated)
+        return result
+
+    def close(self) -> None:
+        """Close the Grid2Op environments."""
+        for environment in self._environments:
+            environment.close()
+
+    def _make_environments(self, n: int) -> list[Any]:
+        scenario = load_scenario(self.grid.id, list_scenarios(self.grid.id, "bundled")[0])
+        first = _make_grid2op(self.grid, scenario, self._dispatch)
+        environments = [first, *(first.copy() for _ in range(n - 1))]
+        for i, environment in enumerate(environments):
+            install_opponent(environment, self.state, self._opponent, i)
+        return environments
+
+    def _clear_flags(self, i: int, plan: EpisodePlan) -> None:
+        state = self.state
+        state.step[i] = 0
+        state.episode_length[i] = plan.n_steps
+        state.decisions[i] = 0
+        state.game_over[i] = int(GameOver.NONE)
+        for flags in (state.terminated, state.truncated, state.illegal, state.ambiguous, state.attacked, state.excused):
+            flags[i] = False
+
+    def _read(self, state: GridState, i: int, observation: Any) -> None:
+        for name in self._observed:
+            getattr(state, name)[i] = getattr(observation, name)
+
+    def _read_game_over(self, state: GridState, i: int, environment: Any, errors: list[Exception]) -> None:
+        """Note why the episode ended, then blank the row as Grid2Op blanks its last observation."""
+        state.terminated[i] = True
+        state.final_topo_vect[i] = environment.backend.topo_vect
+        if self.grid.n_storage:
+            state.storage_power[i] = environment._storage_power
+        if any(isinstance(error, ImpossibleRedispatching) for error in errors):
+            state.game_over[i] = int(GameOver.DISPATCH)
+            state.attacked[i] = False  # the opponent's turn never came
+        else:
+            state.game_over[i] = game_over_reason(state, i)
+        for name in (*_OBSERVED, *_OBSERVED_STORAGE):
+            getattr(state, name)[i] = 0
+        state.topo_vect[i] = -1
+        state.time_next_maintenance[i] = -1
+        state.curtailment_limit[i] = 1
+
+    def _is_impossible(self, i: int, action: StepAction) -> bool:
+        """Whether the whole action is refused because its redispatch can never be carried out.
+
+        Only under ``dispatch="exact"``: Grid2Op itself would keep parts of the action.
+        """
+        if self._dispatch != "exact" or action.kind != ActionKind.INJECTION or action.values is None:
+            return False
+        environment = self._environments[i]
+        return redispatch_is_impossible(
+            decode_continuous(self.grid, action.values).redispatch,
+            environment._target_dispatch,
+            environment._actual_dispatch,
+            environment._already_modified_gen,
+            self.grid.gen_pmin,
+            self.grid.gen_pmax,
+        )
+
+    def _grid2op_action(self, i: int, action: StepAction) -> Any:
+        """A fresh Grid2Op action: Grid2Op caches its verdict of ambiguity on the object."""
+        kind, target = action.kind, action.target
+        if kind == ActionKind.NOTHING:
+            return self._do_nothing[i]
+        result = self._environments[i].action_space()
+        if kind == ActionKind.MOVE:
+            moved = np.zeros(self.grid.dim_topo, np.bool_)
+            moved[moved_elements(self.grid, target, action.mask)] = True
+            result.change_bus = moved
+        elif kind == ActionKind.SWITCH:
+            result.line_change_status = [target]
+        elif kind == ActionKind.RECONNECT:
+            result.line_set_status = [(target, 1)]
+        elif kind == ActionKind.RESTORE:
+            first = int(self.grid.sub_first_element[target])
+            buses = np.zeros(self.grid.dim_topo, np.int32)
+            here = slice(first, first + int(self.grid.sub_info[target]))
+            buses[here] = np.where(self.state.topo_vect[i, here] == 2, 1, 0)
+            result.set_bus = buses
+        elif kind == ActionKind.INJECTION and action.values is not None:
+            injection = decode_continuous(self.grid, action.values)
+            if injection.redispatch.any():
+                result.redispatch = injection.redispatch
+            if injection.storage.any():
+                result.storage_p = injection.storage
+            result.curtail = injection.curtailment_limit
+        return result
+
+
+def _make_grid2op(grid: Grid, scenario: Any, dispatch: str) -> Any:
+    folder = Path(grid2op.__file__).parent / "data" / grid.bundled_names[0]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return grid2op.make(
+            str(folder),
+            backend=LightSimBackend(),
+            action_class=PlayableAction,
+            observation_class=CompleteObservation,
+            reward_class=ConstantReward,
+            other_rewards={},
+            chronics_class=ScenarioChronics,
+            data_feeding_kwargs={"scenario": scenario, "n_line": grid.n_line},
+            redispatch_solver=ExactRedispatchSolver if dispatch == "exact" else None,
+        )
+
+
+def _copy_episode(state: GridState, i: int, result: GridState, horizon: int) -> None:
+    """What a simulated step takes over from the real episode."""
+    result.step[0] = state.step[i] + horizon
+    result.episode_length[0] = state.episode_length[i]
+    result.game_over[0] = int(GameOver.NONE)
+    result.terminated[0] = False
+    result.truncated[0] = False
+    result.attacked[0] = state.attacked[i]
+    result.excused[0] = state.excused[i]

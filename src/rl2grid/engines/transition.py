@@ -1,0 +1,100 @@
+"""From one decision of the agent to the next: its step and the heuristic steps behind it.
+
+A transition adds up rewards, costs and scores of all its grid steps (paper, Section 3.2). A reset plays
+the heuristic to the first decision; what accrues there belongs to the first transition.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from rl2grid.engines.base import Engine
+from rl2grid.engines.effects import clipping, refusal
+from rl2grid.mdp.accumulate import accrue, begin_episode, begin_transition
+from rl2grid.mdp.actions import DO_NOTHING, StepAction
+from rl2grid.mdp.heuristics import is_safe, reconnect_action, recovery_action
+from rl2grid.mdp.rewards import RewardFunction
+from rl2grid.mdp.state import GridState
+from rl2grid.scenarios.episodes import EpisodePlan
+
+HEURISTICS: tuple[str | None, ...] = (None, "idle", "recovery")
+"""What plays while the grid is safe; None: the agent decides every step."""
+
+Listener = Callable[[GridState, int], None]
+"""Called after every grid step with the state and the environment's row."""
+
+
+@dataclass
+class Transitions:
+    """Plays the transitions of the environments of one engine."""
+
+    engine: Engine
+    heuristic: str | None
+    topology_task: bool
+    """On continuous tasks the recovery heuristic only reconnects lines."""
+    reward: RewardFunction
+    gamma: float
+    """Discount between the grid steps of a transition."""
+    listeners: list[Listener] = field(default_factory=list)
+    effects: dict[int, str] = field(default_factory=dict)
+    """By row: what was refused or clipped of the agent's last action."""
+
+    def reset(self, i: int, plan: EpisodePlan) -> None:
+        """Begin an episode and play to its first decision."""
+        state = self.engine.state
+        self.engine.reset(i, plan)
+        self.effects[i] = ""
+        begin_episode(state, i)
+        self._announce(i)
+        self._play_heuristic(i)
+
+    def play(self, i: int, action: StepAction) -> None:
+        """Play the agent's action and all heuristic steps to the next decision.
+
+        The flags ``illegal`` and ``ambiguous`` keep what happened to the agent's own action.
+        """
+        state = self.engine.state
+        if state.decisions[i] > 0:
+            begin_transition(state, i)
+        state.decisions[i] += 1
+        refused = refusal(state, i, action)
+        self._step(i, action)
+        self.effects[i] = refused or clipping(self.engine.grid, state, i, action)
+        illegal, ambiguous = state.illegal[i], state.ambiguous[i]
+        self._play_heuristic(i)
+        state.illegal[i], state.ambiguous[i] = illegal, ambiguous
+
+    def simulate(self, i: int, action: StepAction, horizon: int) -> GridState:
+        """``action`` played on the forecast, without heuristic: row 0 holds what one step would bring."""
+        result = self.engine.simulate(i, action, horizon)
+        begin_episode(result, 0)
+        self._accrue(result, 0)
+        return result
+
+    def _play_heuristic(self, i: int) -> None:
+        state = self.engine.state
+        if self.heuristic is None:
+            return
+        while not (state.terminated[i] or state.truncated[i]) and is_safe(state, i):
+            self._step(i, self._heuristic_action(i))
+
+    def _heuristic_action(self, i: int) -> StepAction:
+        if self.heuristic == "idle":
+            return DO_NOTHING
+        decide = recovery_action if self.topology_task else reconnect_action
+        kind, target = decide(self.engine.state, i)
+        return StepAction(kind, target)
+
+    def _step(self, i: int, action: StepAction) -> None:
+        self.engine.step(i, action)
+        self._accrue(self.engine.state, i)
+        self._announce(i)
+
+    def _accrue(self, state: GridState, i: int) -> None:
+        survive, overload, cost = self.reward.components(state, i)
+        accrue(state, i, survive, overload, cost, self.reward.weights, self.gamma)
+
+    def _announce(self, i: int) -> None:
+        for listener in self.listeners:
+            listener(self.engine.state, i)
