@@ -1,0 +1,168 @@
+"""One environment of a task."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, cast
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from rl2grid.engines.transition import Listener
+from rl2grid.envs.player import SimulationResult, TaskDescription, TaskPlayer, single_spaces
+from rl2grid.envs.tasks import TaskOptions, find_task
+
+
+class PowerGridEnv(gymnasium.Env[NDArray[np.float32], Any], TaskDescription):
+    """Keep a transmission grid alive for a month of 5-minute steps.
+
+    ## Description
+    A grid has substations, lines with a thermal limit, generators that follow a planned schedule, loads
+    and, on some grids, storage. A line above its limit for some steps is tripped by its protection; the
+    flow moves to other lines, which may trip in turn. The episode is lost when a load or generator is cut
+    off, the grid falls apart or no power flow exists. The agent changes the topology (tasks `T`), or
+    redispatches, curtails and uses storage (tasks `R`).
+
+    ## Action space
+    | task | space | meaning |
+    |---|---|---|
+    | `T<level>` | `Discrete(n)` | 0 does nothing; others move a set of a substation's elements to the other busbar or switch a line. `describe_action(a)` says it in words, `action_masks()` which are legal now |
+    | `R` | `Box(-1, 1, (n,), float32)` | redispatch (share of the ramp of a step), curtailment (limit = 1 + min(a, 0)), storage (share of the maximum power); zero does nothing |
+
+    ## Observation space
+    `Box(-inf, inf, (n,), float32)`. `observation_slices` maps each name to its place.
+
+    | feature | size | unit | in |
+    |---|---|---|---|
+    | `t` | 1 | share of the episode | T, R |
+    | `gen_p`, `gen_theta` | generators | MW, degrees | T, R |
+    | `load_p`, `load_theta` | loads | MW, degrees | T, R |
+    | `rho` | lines | share of the thermal limit | T, R |
+    | `time_before_cooldown_line` | lines | steps | T, R |
+    | `topo_vect` | elements | busbar, -1 when off | T |
+    | `line_status`, `timestep_overflow` | lines | 0/1, steps | T |
+    | `time_before_cooldown_sub` | substations | steps | T |
+    | `target_dispatch`, `actual_dispatch` | generators | MW | R |
+    | `gen_margin_up`, `gen_margin_down` | generators | MW | R |
+    | `gen_p_before_curtail`, `curtailment`, `curtailment_limit` | generators | MW, share of pmax | R |
+    | `time_next_maintenance`, `duration_next_maintenance` | lines | steps | T, R |
+    | `storage_charge`, `storage_power_target`, `storage_power`, `storage_theta` | storages | MWh, MW, MW, degrees | where the grid has storage |
+
+    With `normalize="physical"` (the default) every entry is divided by a constant of the grid; see
+    :mod:`rl2grid.mdp.features`.
+
+    ## Rewards
+    `reward="default"`: 1 for surviving, minus half the mean overload, minus half the normalised cost, per
+    grid step; see :mod:`rl2grid.mdp.rewards`. A transition adds up the rewards of its grid steps.
+
+    ## Starting state
+    The reference topology at a row of a scenario: a random row of a training scenario, row 0 elsewhere.
+    `reset(seed=s)` begins the stream of episodes of seed `s`; `reset()` takes its next episode;
+    `reset(options={"scenario": id, "start": row})` chooses.
+
+    ## Episode end
+    `terminated` at a game over, `truncated` when the episode was completed. With a heuristic an episode may
+    end inside `reset`: then `info["over"]` is True and the first `step` ignores its action and returns the
+    ending.
+
+    ## Arguments
+    See :class:`rl2grid.envs.tasks.TaskOptions`.
+
+    ## Information
+    See :data:`rl2grid.envs.info.INFO_KEYS`.
+    """  # noqa: E501
+
+    metadata = {"render_modes": []}  # noqa: RUF012 - Gymnasium's convention
+
+    def __init__(
+        self,
+        task_id: str,
+        *,
+        engine: str = "reference",
+        heuristic: str | None = None,
+        reward: str | tuple[float, float, float] | Callable[..., Any] = "default",
+        split: str = "train",
+        scenario: str | None = None,
+        normalize: str | None = "physical",
+        dispatch: str = "exact",
+        constraint: str | None = None,
+        gamma: float | None = None,
+        maintenance: bool = True,
+        opponent: bool = True,
+    ) -> None:
+        self.task = find_task(task_id)
+        self.options = TaskOptions(
+            engine,
+            heuristic,
+            reward,
+            split,
+            scenario,
+            normalize,
+            dispatch,
+            self.task.constraint or constraint,
+            gamma,
+            maintenance,
+            opponent,
+        )
+        self._player = TaskPlayer(self.task, self.options, 1)
+        observations, self.action_space = single_spaces(self.task)
+        self.observation_space = cast("gymnasium.Space[NDArray[np.float32]]", observations)
+
+    @property
+    def step_listeners(self) -> list[Listener]:
+        """Functions called after every grid step with the state and row 0: append your own."""
+        return self._player.transitions.listeners
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Begin an episode and play to its first decision.
+
+        Raises:
+            UsageError: an option is unknown, or names a scenario or start that does not exist.
+        """
+        super().reset(seed=seed)
+        self._player.reset(0, seed, options)
+        return self._observation(), self._player.info(0)
+
+    def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Play the agent's action and the heuristic steps to the next decision.
+
+        Raises:
+            UsageError: the action has the wrong shape or value, or the episode is over.
+        """
+        player = self._player
+        player.step(0, action)
+        ended = bool(player.state.terminated[0]), bool(player.state.truncated[0])
+        return self._observation(), player.reward(0), *ended, player.info(0)
+
+    def simulate(self, action: Any, horizon: int = 1) -> SimulationResult:
+        """What ``action`` would bring on the forecast ``horizon`` steps ahead; the state stays untouched.
+
+        One grid step is played, without opponent and heuristic; ``docs/simulate.md`` says what happens to
+        maintenance, cooldowns, counters, storage and dispatch.
+
+        Raises:
+            UsageError: a wrong action or horizon, no forecast for it, or no episode in progress.
+        """
+        return self._player.simulate(0, action, horizon)
+
+    def action_masks(self) -> NDArray[np.bool_]:
+        """Which discrete actions are legal now, bool [action].
+
+        Raises:
+            UsageError: the task has continuous actions.
+        """
+        mask = np.zeros(self.task.n_actions, np.bool_)
+        self._player.write_action_mask(0, mask)
+        return mask
+
+    def close(self) -> None:
+        """Free the simulator."""
+        self._player.close()
+
+    def _observation(self) -> NDArray[np.float32]:
+        observation = np.zeros(self.observation_space.shape or (), np.float32)
+        self._player.write_observation(0, observation)
+        return observation

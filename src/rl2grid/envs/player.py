@@ -1,0 +1,303 @@
+"""Several environments of one task, row by row: what the Gymnasium classes share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from rl2grid.engines.base import Engine
+from rl2grid.engines.effects import clipping, refusal
+from rl2grid.engines.transition import Transitions
+from rl2grid.envs.info import episode_info
+from rl2grid.envs.tasks import Task, TaskOptions
+from rl2grid.errors import UsageError
+from rl2grid.grids import Grid
+from rl2grid.mdp.actions import (
+    ActionKind,
+    StepAction,
+    action_set_hash,
+    describe,
+    legal_actions,
+    level_catalogue,
+    level_ids,
+    validate_continuous,
+)
+from rl2grid.mdp.features import feature_slices, observation_size, observation_writer, physical_scale
+from rl2grid.mdp.rewards import resolve_reward
+from rl2grid.mdp.state import GridState
+from rl2grid.scenarios.episodes import EpisodePlan, plan_episode
+
+_RESET_OPTIONS = ("scenario", "start")
+
+
+@dataclass
+class Seat:
+    """Where one environment is in its stream of episodes; enough to play it again."""
+
+    seed: int
+    number: int
+    options: dict[str, Any] = field(default_factory=dict)
+    actions: list[Any] = field(default_factory=list)
+    """The agent's actions since the reset."""
+    grid_steps: int = 0
+    """Grid steps played in earlier episodes of the seed's stream."""
+
+
+@dataclass(frozen=True)
+class SimulationResult:
+    """What an action would bring on the forecast, without opponent and heuristic."""
+
+    observation: NDArray[np.float32]
+    """float32 [feature], as ``step`` returns it."""
+    reward: float
+    cost: float
+    """Cost of the task's constraint; ``info["costs"]`` has both."""
+    terminated: bool
+    """The grid would collapse."""
+    info: dict[str, Any]
+
+
+def make_engine(grid: Grid, n: int, options: TaskOptions) -> Engine:
+    """The engine that ``options`` asks for."""
+    from rl2grid.engines.reference.engine import ReferenceEngine
+
+    return ReferenceEngine(grid, n, options.dispatch, options.opponent)
+
+
+class TaskPlayer:
+    """``n`` environments of one task, addressed by row."""
+
+    def __init__(self, task: Task, options: TaskOptions, n: int) -> None:
+        self.task, self.options, self.grid = task, options, task.grid
+        self.constraint = task.constraint or options.constraint
+        reward = resolve_reward(options.reward)
+        self.engine = make_engine(self.grid, n, options)
+        gamma = 1.0 if options.gamma is None else options.gamma
+        self.transitions = Transitions(self.engine, options.heuristic, task.kind == "T", reward, gamma)
+        self._write_observation = observation_writer(task.kind)
+        self._shift, self._scale = physical_scale(self.grid, task.kind)
+        self._catalogue = level_catalogue(self.grid, task.level) if task.kind == "T" else None
+        self._hash = action_set_hash(self.grid, task.level) if task.kind == "T" else None
+        self._plans: list[EpisodePlan | None] = [None] * n
+        self._seats: list[Seat | None] = [None] * n
+        self._pending = np.zeros(n, np.bool_)  # the episode ended inside reset, its ending is still to be returned
+
+    @property
+    def state(self) -> GridState:
+        return self.engine.state
+
+    def reset(self, i: int, seed: int | None, options: dict[str, Any] | None) -> None:
+        """Begin an episode in row ``i``: the first of ``seed``'s stream, or the next one of the running stream.
+
+        Raises:
+            UsageError: an option is unknown, or names a scenario or start that does not exist.
+        """
+        seat = self._next_seat(i, seed, options or {})
+        plan = self._plan(seat)
+        self._seats[i], self._plans[i] = seat, plan
+        self.transitions.reset(i, plan)
+        self._pending[i] = self.is_over(i)
+
+    def step(self, i: int, action: Any) -> None:
+        """Play the agent's action and the heuristic steps to the next decision.
+
+        Raises:
+            UsageError: the action has the wrong shape or value, or the episode is over.
+        """
+        seat = self._seat(i)
+        played = self._step_action(action)
+        if self._pending[i]:
+            seat.actions.append(action)
+            self._pending[i] = False
+            return
+        if self.is_over(i):
+            raise UsageError("The episode is over: call reset before the next step.")
+        self.transitions.play(i, played)
+        seat.actions.append(action)
+
+    def is_over(self, i: int) -> bool:
+        """The episode of row ``i`` was lost or completed."""
+        return bool(self.state.terminated[i] or self.state.truncated[i])
+
+    def write_observation(self, i: int, out: NDArray[np.float32]) -> None:
+        """Write the observation of row ``i`` to ``out``, float32 [feature]."""
+        self._observe(self.state, i, out)
+
+    def reward(self, i: int) -> float:
+        """Sum of the rewards of the last transition."""
+        return float(self.state.transition_reward[i])
+
+    def info(self, i: int) -> dict[str, Any]:
+        """The ``info`` of row ``i``; see :data:`rl2grid.envs.info.INFO_KEYS`."""
+        plan, seat, state = self._plans[i], self._seat(i), self.state
+        assert plan is not None
+        info = {"scenario": plan.scenario_id, "start": plan.start, **episode_info(state, i, self.constraint)}
+        info["action_effect"] = self.transitions.effects[i]
+        info["grid_steps"] = seat.grid_steps + info["step"]
+        info["over"] = bool(self._pending[i])
+        if self.options.gamma is not None:
+            info["discounted_reward"] = float(state.transition_discounted[i])
+        if self._hash is not None:
+            info["action_set_hash"] = self._hash
+        return info
+
+    def write_action_mask(self, i: int, out: NDArray[np.bool_]) -> None:
+        """Write to ``out`` [action] which actions are legal in row ``i``."""
+        if self._catalogue is None:
+            raise UsageError(f"{self.task.id} has continuous actions: only topology tasks have action masks.")
+        legal_actions(self.state, i, self._catalogue.kind, self._catalogue.target, out)
+
+    def simulate(self, i: int, action: Any, horizon: int) -> SimulationResult:
+        """What one step of ``action`` would bring on the forecast; see :meth:`PowerGridEnv.simulate`."""
+        if not isinstance(horizon, int) or horizon < 1:
+            raise UsageError(f"horizon={horizon!r} is not allowed: give a number of steps, at least 1.")
+        plan, played = self._plans[i], self._step_action(action)
+        if plan is None or self.is_over(i):
+            raise UsageError("There is no episode in progress to simulate from: call reset first.")
+        effect = refusal(self.state, i, played)
+        result = self.transitions.simulate(i, played, horizon)
+        observation = np.zeros(observation_size(self.grid, self.task.kind), np.float32)
+        self._observe(result, 0, observation)
+        info = {"scenario": plan.scenario_id, "start": plan.start, **episode_info(result, 0, self.constraint)}
+        info["action_effect"] = effect or clipping(self.grid, result, 0, played)
+        reward = float(result.transition_reward[0])
+        return SimulationResult(observation, reward, info["cost"], bool(result.terminated[0]), info)
+
+    def state_dict(self) -> list[dict[str, Any]]:
+        """Everything needed to bring all rows back to where they are, as plain values."""
+        return [
+            {
+                "seed": seat.seed,
+                "number": seat.number,
+                "options": dict(seat.options),
+                "actions": [np.asarray(action).tolist() for action in seat.actions],
+                "grid_steps": seat.grid_steps,
+            }
+            for seat in self._seats
+            if seat is not None
+        ]
+
+    def load_state_dict(self, rows: list[dict[str, Any]]) -> None:
+        """Bring row ``i`` to where ``rows[i]`` was, by playing its episode again."""
+        for i, row in enumerate(rows):
+            previous = Seat(row["seed"], row["number"] - 1, grid_steps=row["grid_steps"])
+            self._seats[i], self._plans[i] = previous, None
+            self.reset(i, None, row["options"])
+            for action in row["actions"]:
+                self.step(i, action)
+
+    def close(self) -> None:
+        self.engine.close()
+
+    def _seat(self, i: int) -> Seat:
+        seat = self._seats[i]
+        if seat is None:
+            raise UsageError("The environment was not reset yet: call reset first.")
+        return seat
+
+    def _next_seat(self, i: int, seed: int | None, options: dict[str, Any]) -> Seat:
+        for name in options:
+            if name not in _RESET_OPTIONS:
+                raise UsageError(f"Reset option {name!r} does not exist: choose from {', '.join(_RESET_OPTIONS)}.")
+        previous = self._seats[i]
+        if seed is None and previous is not None:
+            # The rows of a restored seat have not been played: see load_state_dict.
+            played = previous.grid_steps + (int(self.state.step[i]) if self._plans[i] is not None else 0)
+            return Seat(previous.seed, previous.number + 1, options, grid_steps=played)
+        if seed is None:
+            seed = int(np.random.SeedSequence().generate_state(1, np.uint64)[0] >> np.uint64(1))
+        return Seat(int(seed), 0, options)
+
+    def _plan(self, seat: Seat) -> EpisodePlan:
+        return plan_episode(
+            self.grid,
+            self.options.split,
+            seat.seed,
+            seat.number,
+            scenario=seat.options.get("scenario", self.options.scenario),
+            start=seat.options.get("start"),
+            maintenance=self.options.maintenance,
+        )
+
+    def _observe(self, state: GridState, i: int, out: NDArray[np.float32]) -> None:
+        self._write_observation(state, i, out)
+        if self.options.normalize == "physical":
+            out -= self._shift
+            out /= self._scale
+
+    def _step_action(self, action: Any) -> StepAction:
+        if self._catalogue is None:
+            return StepAction(int(ActionKind.INJECTION), values=validate_continuous(self.grid, action))
+        return self._catalogue[action_number(action, len(self._catalogue))]
+
+
+def check_action(task: Task, action: Any) -> None:
+    """Refuse an action of the wrong shape or value.
+
+    Raises:
+        UsageError: what is wrong with it and what is allowed.
+    """
+    if task.kind == "T":
+        action_number(action, task.n_actions)
+    else:
+        validate_continuous(task.grid, action)
+
+
+def action_number(action: Any, n_actions: int) -> int:
+    """A discrete action as a Python integer.
+
+    Raises:
+        UsageError: it is not an integer in 0 .. n_actions - 1.
+    """
+    array = np.asarray(action)
+    if array.shape != () or not np.issubdtype(array.dtype, np.integer) or not 0 <= int(array) < n_actions:
+        raise UsageError(f"Action {action!r} does not exist: give an integer from 0 to {n_actions - 1}.")
+    return int(array)
+
+
+def single_spaces(task: Task) -> tuple[gymnasium.spaces.Box, gymnasium.Space[Any]]:
+    """Observation and action space of one environment."""
+    size = observation_size(task.grid, task.kind)
+    observations = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
+    if task.kind == "T":
+        return observations, gymnasium.spaces.Discrete(task.n_actions)
+    return observations, gymnasium.spaces.Box(-1.0, 1.0, (task.n_actions,), np.float32)
+
+
+class TaskDescription:
+    """What the single and the vector environment say about their task."""
+
+    task: Task
+
+    @property
+    def grid(self) -> Grid:
+        """The task's grid."""
+        return self.task.grid
+
+    @property
+    def observation_slices(self) -> dict[str, slice]:
+        """Where each feature lies in an observation."""
+        return feature_slices(self.task.grid, self.task.kind)
+
+    @property
+    def action_catalogue_ids(self) -> NDArray[np.int32]:
+        """For each discrete action its id in the grid's full catalogue, int32 [action]."""
+        if self.task.kind != "T":
+            raise UsageError(f"{self.task.id} has continuous actions: only topology tasks have a catalogue.")
+        return level_ids(self.task.grid, self.task.level)
+
+    def describe_action(self, action: Any) -> str:
+        """The action in words.
+
+        Raises:
+            UsageError: the action does not exist.
+        """
+        if self.task.kind == "T":
+            catalogue = level_catalogue(self.task.grid, self.task.level)
+            return describe(self.task.grid, catalogue[action_number(action, len(catalogue))])
+        values = validate_continuous(self.task.grid, action)
+        return describe(self.task.grid, StepAction(int(ActionKind.INJECTION), values=values))

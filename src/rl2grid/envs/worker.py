@@ -1,0 +1,118 @@
+"""A process that plays some rows of a vector environment.
+
+Started as ``python -m rl2grid.envs.worker``: unlike a forked process it inherits no threads, and unlike
+:mod:`multiprocessing`'s spawn it does not import the caller's script again, which therefore needs no
+``if __name__ == "__main__"``. Messages are pickles on its standard input and output; the series are
+memory-mapped, so that all workers share one copy. It ends when its input does.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import traceback
+from typing import Any, BinaryIO
+
+from rl2grid.envs.rows import Rows
+from rl2grid.envs.tasks import TaskOptions
+from rl2grid.errors import UsageError
+
+
+class RemoteRows:
+    """:class:`~rl2grid.envs.rows.Rows` in a process of its own.
+
+    Call a method with :meth:`send`, collect its answer with :meth:`receive`.
+    """
+
+    def __init__(self, task_id: str, options: TaskOptions, n: int) -> None:
+        environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "rl2grid.envs.worker"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env=environment,
+        )
+        self.send("make", task_id, options, n)
+
+    def send(self, method: str, *arguments: Any) -> None:
+        """Ask for ``method(*arguments)`` without waiting."""
+        assert self._process.stdin is not None
+        try:
+            pickle.dump((method, arguments), self._process.stdin, pickle.HIGHEST_PROTOCOL)
+            self._process.stdin.flush()
+        except BrokenPipeError:
+            raise self._death() from None
+
+    def receive(self) -> Any:
+        """The answer to the oldest call that was not answered yet.
+
+        Raises:
+            UsageError: the call was refused.
+            RuntimeError: the call failed, or the process died.
+        """
+        assert self._process.stdout is not None
+        try:
+            outcome, value = pickle.load(self._process.stdout)
+        except EOFError:
+            raise self._death() from None
+        if outcome == "refused":
+            raise UsageError(value)
+        if outcome == "failed":
+            raise RuntimeError(f"A worker of the vector environment failed:\n{value}")
+        return value
+
+    def close(self) -> None:
+        """End the process."""
+        if self._process.poll() is None and self._process.stdin is not None:
+            self._process.stdin.close()
+            try:
+                self._process.wait(timeout=10)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+        if self._process.stdout is not None:
+            self._process.stdout.close()
+
+    def _death(self) -> RuntimeError:
+        code = self._process.wait()
+        return RuntimeError(f"A worker of the vector environment died with exit status {code}.")
+
+
+def serve(requests: BinaryIO, answers: BinaryIO) -> None:
+    """Answer requests until they end."""
+    rows: Rows | None = None
+    while True:
+        try:
+            method, arguments = pickle.load(requests)
+        except EOFError:
+            break
+        answer: tuple[str, Any] = ("done", None)
+        try:
+            if method == "make":
+                rows = Rows(*arguments)
+            else:
+                answer = ("done", getattr(rows, method)(*arguments))
+        except UsageError as error:
+            answer = ("refused", str(error))
+        except Exception:
+            answer = ("failed", traceback.format_exc())
+        pickle.dump(answer, answers, pickle.HIGHEST_PROTOCOL)
+        answers.flush()
+    if rows is not None:
+        rows.close()
+
+
+def main() -> None:
+    """Serve on the standard streams; what a library prints goes to the standard error instead."""
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    # An interrupt from the keyboard reaches the whole group: the parent decides when workers end.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    serve(sys.stdin.buffer, answers)
+
+
+if __name__ == "__main__":
+    main()

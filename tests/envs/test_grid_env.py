@@ -1,0 +1,229 @@
+"""The Gymnasium environment: spaces, transitions, endings, simulation, refusals."""
+
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import rl2grid  # noqa: F401 - registers the tasks
+from rl2grid.envs.info import INFO_KEYS
+from rl2grid.envs.tasks import all_tasks
+from rl2grid.errors import UsageError
+from rl2grid.grids import GRID_IDS
+from rl2grid.scenarios.library import list_scenarios
+
+
+def make(task_id, **keywords):
+    return gymnasium.make(f"rl2grid/{task_id}-v0", **keywords)
+
+
+def checked(task_id):
+    with warnings.catch_warnings():
+        # Gymnasium advises bounds for the observation space; loadings have none.
+        warnings.simplefilter("ignore")
+        environment = gymnasium.make(task_id, disable_env_checker=True)
+        check_env(environment.unwrapped, skip_render_check=True)
+        environment.close()
+
+
+@pytest.mark.parametrize("grid_id", GRID_IDS)
+@pytest.mark.parametrize("kind", ["T0", "R"])
+def test_passes_the_environment_checker(grid_id, kind):
+    checked(f"rl2grid/{grid_id}-{kind}-v0")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task_id", sorted(all_tasks()))
+def test_all_tasks_pass_the_environment_checker(task_id):
+    checked(task_id)
+
+
+@pytest.fixture(scope="module")
+def plain():
+    environment = make("bus14-T1", split="bundled", opponent=False, maintenance=False, gamma=0.9)
+    yield environment.unwrapped
+    environment.close()
+
+
+@pytest.fixture(scope="module")
+def idle():
+    environment = make("bus14-T1", split="bundled", heuristic="idle", maintenance=False, gamma=0.9)
+    yield environment.unwrapped
+    environment.close()
+
+
+def month():
+    """A real month of bus14 in which doing nothing fails after some days."""
+    return next(name for name in list_scenarios("bus14", "bundled") if "rte_case14" in name)
+
+
+def test_info_holds_exactly_the_documented_keys(plain):
+    documented = {key.name for key in INFO_KEYS}
+    _, info = plain.reset(seed=0)
+    assert set(info) == documented
+    assert set(plain.step(0)[4]) == documented
+
+
+def test_seed_decides_the_episode(plain):
+    first, info = plain.reset(seed=3)
+    following, _ = plain.reset()
+    again, info_again = plain.reset(seed=3)
+    np.testing.assert_array_equal(first, again)
+    assert info["scenario"] == info_again["scenario"]
+    np.testing.assert_array_equal(following, plain.reset()[0])
+
+
+def test_training_begins_at_random_rows_and_evaluation_at_row_zero():
+    with make("bus14-T0") as environment:
+        starts = {environment.reset(seed=seed)[1]["start"] for seed in range(5)}
+    assert len(starts) > 1
+    with make("bus14-T0", split="test") as environment:
+        assert {environment.reset(seed=seed)[1]["start"] for seed in range(5)} == {0}
+
+
+def test_transition_adds_up_its_grid_steps(plain, idle):
+    """An idle transition equals the same steps played one by one."""
+    options = {"scenario": month(), "start": 0}
+    plain.reset(seed=0, options=options)
+    _, info = idle.reset(seed=0, options=options)
+    assert info["n_steps"] > 100
+    rewards, costs, components = [], [], []
+    while plain.unwrapped._player.state.step[0] < info["step"]:
+        observation, reward, terminated, truncated, single = plain.step(0)
+        rewards.append(reward)
+        costs.append(single["costs"]["TLO"])
+        components.append(single["reward_components"]["overload"])
+        assert single["n_steps"] == 1
+        assert not terminated
+        assert not truncated
+    # One more step by the agent: what accrued inside reset belongs to this first transition.
+    action = 7
+    idle_observation, idle_reward, _, _, idle_info = idle.step(action)
+    observation, reward, _, _, single = plain.step(action)
+    rewards.append(reward)
+    costs.append(single["costs"]["TLO"])
+    components.append(single["reward_components"]["overload"])
+    while len(rewards) < idle_info["n_steps"]:
+        observation, reward, _, _, single = plain.step(0)
+        rewards.append(reward)
+        costs.append(single["costs"]["TLO"])
+        components.append(single["reward_components"]["overload"])
+    np.testing.assert_array_equal(idle_observation, observation)
+    assert idle_reward == pytest.approx(sum(rewards), rel=1e-12)
+    assert idle_info["costs"]["TLO"] == sum(costs)
+    assert idle_info["reward_components"]["overload"] == pytest.approx(sum(components), rel=1e-12)
+    discounted = sum(0.9**k * reward for k, reward in enumerate(rewards))
+    assert idle_info["discounted_reward"] == pytest.approx(discounted, rel=1e-12)
+    assert idle_info["episode_return"] == pytest.approx(sum(rewards), rel=1e-12)
+
+
+def test_idle_never_hands_over_a_safe_grid(idle):
+    idle.reset(seed=0, options={"scenario": month(), "start": 0})
+    for _ in range(5):
+        rho = idle._player.state.rho[0]
+        assert rho.max() >= 0.95
+        if any(idle.step(0)[2:4]):
+            break
+
+
+def test_episode_that_ends_inside_reset_is_returned_by_the_first_step():
+    scenario = next(name for name in list_scenarios("bus14", "bundled") if "rte_case14" not in name)
+    with make("bus14-T0", split="bundled", heuristic="idle", maintenance=False) as environment:
+        observation, info = environment.reset(seed=0, options={"scenario": scenario, "start": 0})
+        if not info["over"]:
+            pytest.fail("the two-day scenario was expected to be safe from its first to its last step")
+        n_steps = info["n_steps"]
+        after, reward, terminated, truncated, info = environment.step(3)
+        assert (terminated, truncated) == (False, True)
+        assert info["survival"] == 1.0
+        assert info["n_steps"] == n_steps
+        assert reward == pytest.approx(info["episode_return"])
+        assert not info["over"]
+        np.testing.assert_array_equal(observation, after)
+        with pytest.raises(UsageError, match="call reset"):
+            environment.unwrapped.step(0)
+
+
+def test_game_over_terminates_and_completion_truncates(plain):
+    plain.reset(seed=0, options={"scenario": month(), "start": 0})
+    (line,) = np.flatnonzero((plain.grid.line_or_to_subid == 7) | (plain.grid.line_ex_to_subid == 7))
+    catalogue = plain.action_catalogue_ids
+    isolate = int(np.flatnonzero(catalogue == len(catalogue) - plain.grid.n_line + line)[0])
+    _, reward, terminated, truncated, info = plain.step(isolate)
+    assert (terminated, truncated) == (True, False)
+    assert reward == 0.0
+    assert info["game_over_text"].startswith("GENERATOR_DISCONNECTED")
+    assert info["costs"] == {"LSI": 2.0, "TLO": info["costs"]["TLO"]}
+    assert info["survival"] == 0.0
+
+
+def test_simulate_returns_what_a_step_would_and_changes_nothing(plain):
+    plain.reset(seed=0)
+    before = plain._observation()
+    result = plain.simulate(7)
+    np.testing.assert_array_equal(before, plain._observation())
+    assert result.observation.shape == before.shape
+    assert result.reward > 0
+    assert result.info["step"] == 1
+    assert not result.terminated
+    with pytest.raises(UsageError, match="at least 1"):
+        plain.simulate(7, horizon=0)
+    with pytest.raises(UsageError, match="no forecast 5 steps ahead"):
+        plain.simulate(7, horizon=5)
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [(209, "0 to 208"), (-1, "0 to 208"), (1.0, "0 to 208"), ([1, 2], "0 to 208"), ("a", "0 to 208")],
+)
+def test_wrong_discrete_action_is_refused(plain, action, message):
+    plain.reset(seed=0)
+    with pytest.raises(UsageError, match=message):
+        plain.step(action)
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (np.zeros(5, np.float32), r"must have shape \(6,\), got \(5,\)"),
+        (np.full(6, np.nan, np.float32), "NaN"),
+        (np.array([0, 0, 1.5, 0, 0, 0], np.float32), "must lie in"),
+    ],
+)
+def test_wrong_continuous_action_is_refused(action, message):
+    with make("bus14-R") as environment:
+        environment.reset(seed=0)
+        with pytest.raises(UsageError, match=message):
+            environment.unwrapped.step(action)
+
+
+def test_wrong_reset_options_are_refused(plain):
+    with pytest.raises(UsageError, match="choose from scenario, start"):
+        plain.reset(options={"scenari": "x"})
+    with pytest.raises(UsageError, match="is not in the split bundled of bus14: choose one of"):
+        plain.reset(options={"scenario": "no such month"})
+
+
+def test_observation_slices_cover_the_observation(plain):
+    slices = plain.observation_slices
+    assert next(iter(slices)) == "t"
+    assert sum(s.stop - s.start for s in slices.values()) == plain.observation_space.shape[0]
+
+
+def test_physical_units_on_request():
+    with make("bus14-T0", normalize=None) as environment:
+        observation, _ = environment.reset(seed=0)
+        slices = environment.unwrapped.observation_slices
+        np.testing.assert_array_equal(observation[slices["gen_p"]], environment.unwrapped._player.state.gen_p[0])
+
+
+def test_step_listeners_see_every_grid_step(idle):
+    seen = []
+    idle.step_listeners.append(lambda state, i: seen.append(int(state.step[i])))
+    try:
+        _, info = idle.reset(seed=0, options={"scenario": month(), "start": 0})
+    finally:
+        idle.step_listeners.clear()
+    assert seen == list(range(info["step"] + 1))

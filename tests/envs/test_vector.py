@@ -1,0 +1,147 @@
+"""The vector environment plays what single environments play, in any number of processes."""
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+
+import rl2grid  # noqa: F401 - registers the tasks
+from rl2grid.errors import UsageError
+
+KEYWORDS = {"heuristic": "idle", "gamma": 0.99}
+
+
+def make_vector(num_envs, num_workers, task_id="rl2grid/bus14-T0-v0", **keywords):
+    return gymnasium.make_vec(task_id, num_envs=num_envs, num_workers=num_workers, **KEYWORDS | keywords)
+
+
+def actions_of(step, num_envs):
+    return np.random.default_rng(step).integers(50, size=num_envs)
+
+
+def play(vector, steps):
+    """Everything that a vector returns over some steps of a fixed sequence of actions."""
+    observations = [vector.reset(seed=5)[0]]
+    rewards, ends, infos = [], [], []
+    for step in range(steps):
+        observation, reward, terminated, truncated, info = vector.step(actions_of(step, vector.num_envs))
+        observations.append(observation)
+        rewards.append(reward)
+        ends.append(terminated | truncated)
+        infos.append(info)
+    return np.array(observations), np.array(rewards), np.array(ends), infos
+
+
+def test_made_by_gymnasium_with_autoreset_in_the_same_step():
+    vector = make_vector(2, 0)
+    assert vector.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
+    assert vector.observation_space.shape == (2, *vector.single_observation_space.shape)
+    vector.close()
+
+
+def test_processes_and_batch_size_do_not_matter():
+    inside, workers, fewer = make_vector(3, 0), make_vector(3, 2), make_vector(2, 1)
+    a, b = play(inside, 25), play(workers, 25)
+    for x, y in zip(a[:3], b[:3], strict=True):
+        np.testing.assert_array_equal(x, y)
+    assert a[2].any(), "no episode ended: the test did not see an autoreset"
+    fewer.reset(seed=5)
+    for step in range(25):
+        observation = fewer.step(actions_of(step, 3)[:2])[0]
+        np.testing.assert_array_equal(observation, a[0][step + 1, :2])
+    for vector in (inside, workers, fewer):
+        vector.close()
+
+
+def test_equals_single_environments_and_shows_the_ending():
+    vector = make_vector(2, 0)
+    singles = [gymnasium.make("rl2grid/bus14-T0-v0", **KEYWORDS) for _ in range(2)]
+    observations, _ = vector.reset(seed=5)
+    for i, single in enumerate(singles):
+        np.testing.assert_array_equal(single.reset(seed=5 + i)[0], observations[i])
+    endings = 0
+    for step in range(25):
+        actions = actions_of(step, 2)
+        observations, rewards, terminated, truncated, infos = vector.step(actions)
+        for i, single in enumerate(singles):
+            observation, reward, over, complete, info = single.step(int(actions[i]))
+            assert (rewards[i], terminated[i], truncated[i]) == (reward, over, complete)
+            if over or complete:
+                endings += 1
+                np.testing.assert_array_equal(infos["final_obs"][i], observation)
+                assert infos["_final_info"][i]
+                assert infos["final_info"]["survival"][i] == info["survival"]
+                assert infos["final_info"]["costs"]["TLO"][i] == info["costs"]["TLO"]
+                observation, info = single.reset()
+            np.testing.assert_array_equal(observations[i], observation)
+            assert infos["n_steps"][i] == info["n_steps"]
+            assert infos["discounted_reward"][i] == info["discounted_reward"]
+            assert infos["grid_steps"][i] == info["grid_steps"]
+    assert endings > 0
+    for environment in (vector, *singles):
+        environment.close()
+
+
+def test_state_is_restored_by_playing_again():
+    straight, resumed = make_vector(2, 0), make_vector(2, 1)
+    straight.reset(seed=1)
+    for step in range(6):
+        straight.step(actions_of(step, 2))
+    saved = straight.state_dict()
+    resumed.load_state_dict(saved)
+    for step in range(6, 14):
+        a, b = straight.step(actions_of(step, 2)), resumed.step(actions_of(step, 2))
+        for x, y in zip(a[:4], b[:4], strict=True):
+            np.testing.assert_array_equal(x, y)
+        np.testing.assert_array_equal(a[4]["grid_steps"], b[4]["grid_steps"])
+    straight.close()
+    resumed.close()
+
+
+def test_masks_are_those_of_the_rules():
+    vector = make_vector(2, 0, "rl2grid/bus36-M-T0-v0", heuristic=None)
+    vector.reset(seed=0)
+    assert vector.action_masks().all()
+    vector.step([1, 0])
+    masks = vector.action_masks()
+    assert not masks[0].all()
+    assert masks[0, 0]
+    assert masks[1].all()
+    vector.close()
+
+
+def test_refused_action_steps_no_environment():
+    vector = make_vector(2, 0)
+    vector.reset(seed=0)
+    before = vector.state_dict()
+    with pytest.raises(UsageError, match="from 0 to 49"):
+        vector.step([0, 50])
+    assert vector.state_dict() == before
+    with pytest.raises(UsageError, match="give one each"):
+        vector.step([0])
+    vector.close()
+
+
+def test_refusals_of_a_worker_arrive_as_one_sentence():
+    vector = make_vector(2, 2)
+    with pytest.raises(UsageError, match="is not in the split train of bus14: choose one of"):
+        vector.reset(options={"scenario": "no such month"})
+    assert vector.reset(seed=0)[0].shape[0] == 2, "the workers must still answer"
+    vector.close()
+
+
+def test_dead_worker_is_reported():
+    vector = make_vector(1, 1)
+    vector.reset(seed=0)
+    vector.unwrapped._remotes[0]._process.kill()
+    with pytest.raises(RuntimeError, match="died"):
+        vector.step([0])
+    vector.close()
+
+
+@pytest.mark.parametrize("keywords", [{"num_envs": 0}, {"num_envs": 2, "num_workers": -1}])
+def test_wrong_sizes_are_refused(keywords):
+    from rl2grid.envs.vector import PowerGridVectorEnv
+
+    with pytest.raises(UsageError, match="is not allowed"):
+        PowerGridVectorEnv("rl2grid/bus14-T0-v0", **keywords)
