@@ -1,0 +1,56 @@
+"""What the evaluation asks of an agent, trained or not."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Protocol, runtime_checkable
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+Observation = NDArray[np.float32]
+Action = Any
+"""``int`` on topology tasks (Discrete), float32 [continuous] in [-1, 1] on redispatching tasks (Box)."""
+Info = Mapping[str, Any]
+
+
+@runtime_checkable
+class Agent(Protocol):
+    """An agent that plays one environment."""
+
+    name: str
+    """What tables and figures call the agent."""
+
+    def bind(self, env: gymnasium.Env[Any, Any]) -> None:
+        """Look at the environment to be played (its spaces, its grid); called once, before anything else.
+
+        Raises:
+            UsageError: the agent cannot play this task.
+        """
+
+    def reset(self, i: int) -> None:
+        """Forget everything about environment ``i``: a new episode of it begins."""
+
+    def act(self, observation: Observation, info: Info) -> Action:
+        """The action for an observation (float32, one axis) and the ``info`` that came with it."""
+
+
+@runtime_checkable
+class RandomizedAgent(Protocol):
+    """An agent that draws random numbers, from a stream that the evaluation names per episode.
+
+    That makes an episode's actions a function of the seed and the scenario alone, whichever
+    worker plays it and whatever was played before.
+    """
+
+    def seed_episode(self, seed: int, episode: int) -> None:
+        """Draw from the stream (``seed``, ``episode``) from the next ``reset`` on."""
+
+
+def no_intervention(space: gymnasium.Space[Any]) -> Action:
+    """The action that changes nothing: id 0 of a topology task, zeros of a redispatching task."""
+    if isinstance(space, gymnasium.spaces.Discrete):
+        return 0
+    assert isinstance(space, gymnasium.spaces.Box)
+    return np.zeros(space.shape, space.dtype)

@@ -1,0 +1,69 @@
+"""The recovery heuristic's decisions, as an agent (paper, Section 3.2)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from rl2grid.agents.agent import Action, Info, Observation
+from rl2grid.errors import UsageError
+from rl2grid.mdp.actions import ActionKind, full_catalogue
+from rl2grid.mdp.heuristics import is_safe, recovery_action
+from rl2grid.mdp.state import GridState
+
+_NOTHING = 0
+
+
+class Recovery:
+    """While the grid is safe, brings it back to its reference topology, one action per step; else does nothing.
+
+    It plays with the actions of the task: where the step that the heuristic would take is not among
+    them (the lower levels leave most out), it does nothing.
+    """
+
+    name = "recovery"
+
+    def bind(self, env: gymnasium.Env[Any, Any]) -> None:
+        """Index the actions of the task, and listen to its grid steps: observations may be scaled.
+
+        Raises:
+            UsageError: the task has no topology actions.
+        """
+        if not isinstance(env.action_space, gymnasium.spaces.Discrete):
+            raise UsageError(
+                "Agent 'recovery' cannot play a redispatching task (-R-), which has no topology actions: "
+                "choose a topology task (-T0-, -T1-, ...) or the keyword heuristic='recovery'."
+            )
+        base: Any = env.unwrapped
+        base.step_listeners.append(self._hear)
+        actions = full_catalogue(base.grid).take(base.action_catalogue_ids)
+        keys = zip(actions.kind.tolist(), actions.target.tolist(), actions.mask.tolist(), strict=True)
+        self._action = {key: action for action, key in enumerate(keys)}
+
+    def reset(self, i: int) -> None:
+        """Nothing to forget."""
+
+    def act(self, observation: Observation, info: Info) -> Action:
+        """The id of the heuristic's action, 0 where it would idle or the task lacks that action."""
+        state, row = self._state, self._row
+        if not is_safe(state, row):
+            return _NOTHING
+        kind, target = recovery_action(state, row)
+        if kind == ActionKind.RECONNECT:
+            return self._action.get((int(ActionKind.SWITCH), int(target), 0), _NOTHING)
+        if kind == ActionKind.RESTORE:
+            mask = _on_second_busbar(state, row, int(target))
+            return self._action.get((int(ActionKind.MOVE), int(target), mask), _NOTHING)
+        return _NOTHING
+
+    def _hear(self, state: GridState, row: int) -> None:
+        self._state, self._row = state, row
+
+
+def _on_second_busbar(state: GridState, row: int, sub: int) -> int:
+    """The elements of a substation that sit on busbar 2, as the mask of a move."""
+    first, size = int(state.sub_first_element[sub]), int(state.sub_info[sub])
+    busbars = state.topo_vect[row, first : first + size]
+    return int(sum(1 << k for k in np.flatnonzero(busbars == 2).tolist()))

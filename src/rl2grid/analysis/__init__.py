@@ -1,0 +1,1 @@
+"""What evaluations say: statistics, tables, figures and reports."""

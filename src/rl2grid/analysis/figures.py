@@ -1,0 +1,437 @@
+"""Figures: training curves, survival by agent, and the loading of every line through an episode.
+
+Colours are those of Okabe and Ito, told apart by people with any colour vision; nothing is said by colour
+alone. Figures are drawn without pyplot: nothing global changes, and no display is needed.
+"""
+
+from __future__ import annotations
+
+import io
+import itertools
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import Colormap, LinearSegmentedColormap, ListedColormap, Normalize
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import FuncFormatter, PercentFormatter
+from numpy.typing import NDArray
+
+from rl2grid.analysis.recordings import Recording
+from rl2grid.analysis.results import EvaluationResult
+from rl2grid.analysis.statistics import Floats, bootstrap_band, trailing_mean
+from rl2grid.analysis.training import TrainingCurve
+
+BLUE, VERMILLION, GREEN, ORANGE, SKY, PURPLE = "#0072B2", "#D55E00", "#009E73", "#E69F00", "#56B4E9", "#CC79A7"
+STEPS_PER_DAY = 288
+SAFE_LOADING, FULL_SCALE = 1.0, 1.5
+MAX_COLUMNS = 360
+"""Columns of a heatmap: more steps are pooled, each pool showing its highest loading, so that an overload of one
+step is wide enough to be seen."""
+MAX_LABELS = 40
+CURVE_POINTS = 200
+SMOOTHING_SHARE = 20
+"""Curves are smoothed over one part in this many of their points."""
+
+
+@dataclass(frozen=True)
+class Theme:
+    """Colours of paper and ink."""
+
+    name: str
+    background: str
+    text: str
+    muted: str
+    rule: str
+    loading: tuple[str, ...]
+    """From a line without load to one at its limit."""
+    out: str
+    """A line out of service."""
+    series: tuple[str, ...]
+    """Of lines and dots, in order of use."""
+
+
+LIGHT = Theme(
+    name="light",
+    background="#ffffff",
+    text="#1b1f24",
+    muted="#667079",
+    rule="#e4e7ea",
+    loading=("#f4f7fa", "#a9cbe6", "#4a8fc7", "#0b3866"),
+    out="#b9bec4",
+    series=(BLUE, VERMILLION, GREEN, ORANGE, PURPLE, SKY),
+)
+DARK = Theme(
+    name="dark",
+    background="#15181c",
+    text="#e8eaed",
+    muted="#9aa3ad",
+    rule="#30363d",
+    loading=("#1b232c", "#1f4f7d", "#4a8fc7", "#b5dcff"),
+    out="#5b626b",
+    series=(SKY, ORANGE, GREEN, PURPLE, VERMILLION, BLUE),
+)
+
+
+def training_curves(
+    curves: Sequence[TrainingCurve], *, x: str = "decisions", theme: Theme = LIGHT, title: str = "Survival in training"
+) -> Figure:
+    """Survival of training episodes against the budget; runs with one label are one line.
+
+    One run shows its trailing mean with the 95% interval of that mean, over points that stay visible.
+    Several runs show the mean of their trailing means with a 95% bootstrap interval over runs. Diamonds are
+    validation.
+
+    Args:
+        curves: at least one; see :func:`rl2grid.analysis.training.read_training_curve`.
+        x: ``"decisions"`` or ``"grid_steps"``.
+        theme: colours.
+        title: of the figure.
+    """
+    with matplotlib.rc_context(_style(theme)):
+        figure = Figure(figsize=(6.4, 3.6), layout="constrained")
+        axes = figure.subplots()
+        labels = list(dict.fromkeys(curve.label for curve in curves))
+        for label, colour in zip(labels, itertools.cycle(theme.series), strict=False):
+            runs = [curve for curve in curves if curve.label == label]
+            _draw_curve(axes, label, runs, x, colour)
+            _draw_validation(axes, runs, x, colour, theme)
+        axes.set(xlabel="Decisions" if x == "decisions" else "Grid steps", ylim=(0, 1.03))
+        axes.set_xlim(left=0)
+        axes.xaxis.set_major_formatter(FuncFormatter(_thousands))
+        axes.yaxis.set_major_formatter(PercentFormatter(1.0))
+        axes.grid(axis="y")
+        _headline(axes, title, "share of the episode survived; band: 95% interval of the smoothed mean")
+        handles, _ = axes.get_legend_handles_labels()
+        if any(curve.validation_survival.size for curve in curves):
+            handles.append(_marker("D", theme.text, "validation"))
+        axes.legend(handles=handles, loc="lower right")
+    return figure
+
+
+def survival_by_agent(
+    results: Sequence[EvaluationResult], *, theme: Theme = LIGHT, title: str = "Survival by agent"
+) -> Figure:
+    """Every episode as a dot, the mean with its 95% interval, and both in numbers; the best agent on top."""
+    ranked = sorted(results, key=lambda result: result.summary.survival.value)
+    with matplotlib.rc_context(_style(theme)):
+        figure = Figure(figsize=(6.4, 1.35 + 0.62 * len(ranked)), layout="constrained")
+        axes = figure.subplots()
+        for row, result in enumerate(ranked):
+            _draw_agent(axes, row, result, theme.series[0] if row == len(ranked) - 1 else theme.muted, theme)
+        axes.set_yticks(range(len(ranked)), [_agent_label(result) for result in ranked])
+        axes.set(xlim=(-0.015, 1.015), ylim=(-0.55, len(ranked) - 0.45))
+        axes.xaxis.set_major_formatter(PercentFormatter(1.0))
+        axes.set_xlabel("Share of the episode survived")
+        axes.grid(axis="x")
+        axes.tick_params(axis="y", length=0)
+        axes.spines["left"].set_visible(False)
+        first = ranked[0].summary
+        counted = _counted(first.scenarios, "scenario") + (
+            f", {_counted(first.seeds, 'seed')} each" if first.seeds > 1 else ""
+        )
+        _headline(axes, title, f"dots: episodes ({counted}); diamond and bar: mean and 95% interval")
+    return figure
+
+
+def episode_loading(recording: Recording, *, theme: Theme = LIGHT) -> Figure:
+    """Loading of every line through one episode, with outages, the agent's decisions, and how it ended.
+
+    Lines are ordered by their loading, the most loaded on top.
+    """
+    n_line = len(recording.line_names)
+    with matplotlib.rc_context(_style(theme)):
+        height = float(np.clip(0.13 * n_line, 2.2, 7.0))
+        figure = Figure(figsize=(8.4, height + 2.5), layout="constrained")
+        peak, heat, marks = figure.subplots(
+            3, 1, sharex=True, gridspec_kw={"height_ratios": [0.9, height, 0.5], "hspace": 0.02}
+        )
+        unit = STEPS_PER_DAY if recording.n_steps > 2 * STEPS_PER_DAY else 12
+        time = np.arange(len(recording.rho)) / unit
+        _draw_peak(peak, recording, time, theme)
+        image, legend = _draw_heat(heat, recording, time[-1], theme)
+        _draw_decisions(marks, recording, unit, theme)
+        _draw_ending([peak, heat, marks], recording, time[-1], theme)
+        marks.set_xlabel("Days" if unit == STEPS_PER_DAY else "Hours")
+        marks.set_xlim(0, time[-1] * 1.012 if time[-1] else 1)
+        bar = figure.colorbar(image, ax=heat, pad=0.01, fraction=0.03, aspect=28, extend="max")
+        bar.ax.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+        bar.set_ticks([0, 0.5, 1, FULL_SCALE])
+        bar.outline.set_visible(False)
+        bar.set_label("Loading")
+        if legend:
+            figure.legend(handles=legend, loc="outside lower right", ncols=len(legend), frameon=False, handlelength=1.2)
+        _headline(peak, *_episode_words(recording))
+    return figure
+
+
+def save_figure(figure: Figure, path: Path, *, formats: Sequence[str] = ("png", "pdf")) -> list[Path]:
+    """Write a figure as ``path`` with each of the suffixes, each file whole or not at all."""
+    written = []
+    for suffix in formats:
+        target = path.with_name(f"{path.name}.{suffix}")
+        temporary = path.with_name(f"{path.name}.{suffix}.tmp")
+        temporary.write_bytes(_render(figure, suffix))
+        os.replace(temporary, target)
+        written.append(target)
+    return written
+
+
+def png_bytes(figure: Figure) -> bytes:
+    """A figure as PNG."""
+    return _render(figure, "png")
+
+
+def _render(figure: Figure, suffix: str) -> bytes:
+    file = io.BytesIO()
+    # Without a date in it: the same results give the same file.
+    metadata = {"png": {"Software": None}, "pdf": {"CreationDate": None}}.get(suffix)
+    figure.savefig(file, format=suffix, dpi=200, metadata=metadata, facecolor=figure.get_facecolor())
+    return file.getvalue()
+
+
+def _draw_curve(axes: Axes, label: str, runs: Sequence[TrainingCurve], x: str, colour: str) -> None:
+    budgets = [np.asarray(getattr(run, x), np.float64) for run in runs]
+    smoothed = [trailing_mean(run.survival, max(1, len(run.survival) // SMOOTHING_SHARE)) for run in runs]
+    if len(runs) == 1:
+        position, (average, low, high) = budgets[0], smoothed[0]
+        axes.plot(position, runs[0].survival, ".", color=colour, alpha=0.35, markersize=4, markeredgewidth=0)
+    else:
+        last = min(budget[-1] for budget in budgets)
+        position = np.linspace(max(budget[0] for budget in budgets), last, CURVE_POINTS)
+        curves = [np.interp(position, budget, line[0]) for budget, line in zip(budgets, smoothed, strict=True)]
+        average, low, high = bootstrap_band(curves)
+    axes.fill_between(position, np.clip(low, 0, 1), np.clip(high, 0, 1), color=colour, alpha=0.2, linewidth=0)
+    axes.plot(
+        position, average, color=colour, linewidth=2, label=label if len(runs) == 1 else f"{label} ({len(runs)} runs)"
+    )
+
+
+def _draw_validation(axes: Axes, runs: Sequence[TrainingCurve], x: str, colour: str, theme: Theme) -> None:
+    """Mean over runs, at the points of the run with the fewest."""
+    validated = [
+        (getattr(run, f"validation_{x}"), run.validation_survival) for run in runs if run.validation_survival.size
+    ]
+    if not validated:
+        return
+    position = min((budget for budget, _ in validated), key=len)
+    survival = np.mean([np.interp(position, *points) for points in validated], axis=0)
+    axes.plot(position, survival, "D", color=colour, markersize=5.5, markeredgecolor=theme.background, zorder=4)
+
+
+def _draw_agent(axes: Axes, row: int, result: EvaluationResult, colour: str, theme: Theme) -> None:
+    survival = np.array([episode.survival for episode in result.episodes])
+    estimate = result.summary.survival
+    axes.plot(
+        survival,
+        row - 0.12 + 0.34 * _spread(survival),
+        "o",
+        color=colour,
+        alpha=0.45,
+        markersize=4.5,
+        markeredgewidth=0,
+    )
+    axes.plot(
+        [estimate.low, estimate.high], [row - 0.27] * 2, color=colour, linewidth=4, solid_capstyle="round", alpha=0.55
+    )
+    axes.plot(estimate.value, row - 0.27, "D", color=colour, markersize=7, markeredgecolor=theme.background, zorder=4)
+    axes.annotate(
+        f"{100 * estimate.value:.1f}%\n[{100 * estimate.low:.1f}, {100 * estimate.high:.1f}]",
+        (1.0, row),
+        xycoords=("axes fraction", "data"),
+        xytext=(8, 0),
+        textcoords="offset points",
+        va="center",
+        fontsize=8,
+        color=theme.text,
+    )
+
+
+def _draw_peak(axes: Axes, recording: Recording, time: Floats, theme: Theme) -> None:
+    peak = np.where(recording.line_status, recording.rho, 0).max(axis=1)
+    axes.plot(time, peak, color=theme.series[0], linewidth=0.9)
+    axes.axhline(SAFE_LOADING, color=VERMILLION, linewidth=0.9, linestyle=(0, (4, 2)))
+    axes.fill_between(
+        time, SAFE_LOADING, peak, where=peak > SAFE_LOADING, color=VERMILLION, linewidth=0, interpolate=True
+    )
+    axes.set_ylim(0, max(1.15, float(peak.max()) * 1.05))
+    axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+    axes.set_yticks([0, SAFE_LOADING])
+    axes.set_ylabel("Highest", rotation=0, ha="right", va="center")
+    axes.tick_params(axis="x", length=0)
+
+
+def _draw_heat(axes: Axes, recording: Recording, end: float, theme: Theme) -> tuple[Any, list[Patch]]:
+    """Returns the image and what its flat colours mean."""
+    order = np.argsort(-np.quantile(np.where(recording.line_status, recording.rho, 0), 0.95, axis=0), kind="stable")
+    pools = _pools(len(recording.rho))
+    loading = np.where(recording.line_status, recording.rho, np.nan)[:, order]
+    loading = np.stack([_highest(loading[pool]) for pool in pools], axis=1)
+    extent = (0.0, max(end, 1e-9), len(order) - 0.5, -0.5)
+    image = axes.imshow(
+        loading,
+        cmap=_loading_colours(theme),
+        norm=Normalize(0, FULL_SCALE),
+        aspect="auto",
+        extent=extent,
+        interpolation="nearest",
+    )
+    legend = []
+    if np.isnan(loading).any():
+        legend.append(Patch(color=theme.out, label="out of service"))
+    for name, flags, colour in (("attacked", recording.attacked, PURPLE), ("maintenance", recording.maintained, GREEN)):
+        pooled = np.stack([flags[pool][:, order].any(axis=0) for pool in pools], axis=1)
+        if not pooled.any():
+            continue
+        axes.imshow(
+            np.where(pooled, 1.0, np.nan),
+            cmap=ListedColormap([colour]),
+            aspect="auto",
+            extent=extent,
+            interpolation="nearest",
+        )
+        legend.append(Patch(color=colour, label=name))
+    step = -(-len(order) // MAX_LABELS)
+    shown = range(0, len(order), step)
+    axes.set_yticks(list(shown), [recording.line_names[order[row]] for row in shown], fontsize=6)
+    axes.tick_params(axis="both", length=0)
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+    return image, legend
+
+
+def _draw_decisions(axes: Axes, recording: Recording, unit: int, theme: Theme) -> None:
+    asked = np.array(recording.decision_steps, np.float64) / unit
+    acted = asked[[bool(words) for words in recording.actions]] if len(asked) else asked
+    axes.eventplot(
+        [asked, acted], colors=[theme.muted, VERMILLION], lineoffsets=[1, 0], linelengths=0.8, linewidths=0.8
+    )
+    axes.set_yticks([0, 1], [f"acts ({len(acted):,})", f"decides ({len(asked):,})"], fontsize=7)
+    axes.set_ylim(-0.6, 1.6)
+    axes.tick_params(axis="y", length=0)
+    axes.spines["left"].set_visible(False)
+
+
+def _draw_ending(panels: Sequence[Axes], recording: Recording, end: float, theme: Theme) -> None:
+    if not recording.game_over:
+        return
+    for axes in panels:
+        axes.axvline(end, color=theme.text, linewidth=1.6)
+    panels[0].annotate(
+        "game over", (end, 0.0), xycoords=("data", "axes fraction"), xytext=(-5, 4), textcoords="offset points",
+        ha="right", va="bottom", fontsize=8, fontweight="bold", color=theme.text,
+    )  # fmt: skip
+
+
+def _episode_words(recording: Recording) -> tuple[str, str]:
+    """Headline and sentence below it."""
+    task = recording.task.removeprefix("rl2grid/")
+    with_heuristic = "" if recording.heuristic == "none" else f" + {recording.heuristic}"
+    survived = f"survived {recording.n_steps:,} of {recording.episode_length:,} steps"
+    ending = recording.game_over or "the episode was completed"
+    return (
+        f"Line loading: {recording.agent}{with_heuristic} on {task}",
+        f"scenario {recording.scenario}, seed {recording.seed}: {survived}; {ending}",
+    )
+
+
+def _loading_colours(theme: Theme) -> Colormap:
+    """Up to the limit from empty to full, beyond it another hue: an overload is never a shade of normal."""
+    below = LinearSegmentedColormap.from_list("below", theme.loading)
+    above = LinearSegmentedColormap.from_list("above", ["#F28E2B", VERMILLION, "#A50F15"])
+    n = 300
+    limit = round(n * SAFE_LOADING / FULL_SCALE)
+    colours = [below(k / (limit - 1)) for k in range(limit)] + [above(k / (n - limit - 1)) for k in range(n - limit)]
+    return ListedColormap(colours).with_extremes(bad=theme.out, over="#7A0010")
+
+
+def _pools(n_steps: int) -> list[slice]:
+    bounds = np.linspace(0, n_steps, min(n_steps, MAX_COLUMNS) + 1).astype(int)
+    return [slice(int(first), int(last)) for first, last in itertools.pairwise(bounds)]
+
+
+def _highest(loading: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Highest loading over the first axis; NaN only where a line was out all the time."""
+    highest = np.where(np.isnan(loading), -np.inf, loading).max(axis=0)
+    return np.where(np.isinf(highest), np.nan, highest).astype(np.float32)
+
+
+def _spread(values: Floats) -> Floats:
+    """Heights in [0, 1] that keep dots with near values apart: the golden ratio's sequence in order of value."""
+    heights = np.empty(len(values))
+    heights[np.argsort(values, kind="stable")] = (np.arange(len(values)) * 0.6180339887) % 1.0
+    return heights
+
+
+def _agent_label(result: EvaluationResult) -> str:
+    summary = result.summary
+    return summary.agent if summary.heuristic == "none" else f"{summary.agent}\n+ {summary.heuristic}"
+
+
+def _counted(number: int, noun: str) -> str:
+    return f"{number} {noun}{'s' if number != 1 else ''}"
+
+
+def _marker(symbol: str, colour: str, label: str) -> Line2D:
+    return Line2D([], [], linestyle="", marker=symbol, color=colour, markersize=5, label=label)
+
+
+def _headline(axes: Axes, title: str, sentence: str) -> None:
+    axes.set_title(sentence, loc="left", fontsize=8, color=matplotlib.rcParams["xtick.color"], pad=6)
+    axes.annotate(
+        title,
+        (0, 1),
+        xycoords="axes fraction",
+        xytext=(0, 20),
+        textcoords="offset points",
+        fontsize=11,
+        fontweight="bold",
+    )
+
+
+def _thousands(value: float, _: int | None) -> str:
+    if value >= 1e6:
+        return f"{value / 1e6:g}M"
+    return f"{value / 1e3:g}k" if value >= 1e3 else f"{value:g}"
+
+
+def _style(theme: Theme) -> dict[str, Any]:
+    return {
+        "figure.facecolor": theme.background,
+        "axes.facecolor": theme.background,
+        "savefig.facecolor": theme.background,
+        "text.color": theme.text,
+        "axes.labelcolor": theme.text,
+        "axes.titlecolor": theme.text,
+        "xtick.color": theme.muted,
+        "ytick.color": theme.muted,
+        "xtick.labelcolor": theme.text,
+        "ytick.labelcolor": theme.text,
+        "axes.edgecolor": theme.muted,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.linewidth": 0.8,
+        "axes.axisbelow": True,
+        "grid.color": theme.rule,
+        "grid.linewidth": 0.8,
+        "font.family": "DejaVu Sans",
+        "font.size": 9,
+        "axes.labelsize": 9,
+        "xtick.labelsize": 8,
+        "ytick.labelsize": 8,
+        "legend.fontsize": 8,
+        "legend.frameon": True,
+        "legend.facecolor": theme.background,
+        "legend.edgecolor": theme.rule,
+        "legend.framealpha": 0.9,
+        "figure.constrained_layout.w_pad": 0.12,
+        "figure.constrained_layout.h_pad": 0.12,
+        "pdf.fonttype": 42,
+    }

@@ -1,0 +1,20 @@
+"""Versions of everything that a result depends on."""
+
+from __future__ import annotations
+
+import platform
+from importlib import metadata
+
+LIBRARIES: tuple[str, ...] = ("rl2grid", "grid2op", "lightsim2grid", "numba", "numpy", "gymnasium", "torch")
+"""Packages whose version is part of the identity of a result."""
+
+
+def library_versions() -> dict[str, str]:
+    """Versions of Python and of :data:`LIBRARIES`; packages that are not installed are left out."""
+    versions = {"python": platform.python_version()}
+    for library in LIBRARIES:
+        try:
+            versions[library] = metadata.version(library)
+        except metadata.PackageNotFoundError:
+            continue
+    return versions

@@ -1,0 +1,98 @@
+"""Made-up episodes, results, curves and recordings."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from rl2grid.analysis.episodes import Episode
+from rl2grid.analysis.recordings import Recording
+from rl2grid.analysis.results import EvaluationResult
+from rl2grid.analysis.training import TrainingCurve
+
+TASK = "rl2grid/bus14-T0-v0"
+
+
+def episode(scenario: str = "may", seed: int = 0, survival: float = 1.0, **changes: Any) -> Episode:
+    completed = survival == 1.0
+    values: dict[str, Any] = {
+        "task": TASK,
+        "agent": "someone",
+        "heuristic": "none",
+        "split": "validation",
+        "scenario": scenario,
+        "seed": seed,
+        "start": 0,
+        "episode_length": 100,
+        "grid_steps": round(100 * survival) + (not completed),
+        "decisions": 7,
+        "survival": survival,
+        "completed": completed,
+        "game_over": "NONE" if completed else "DIVERGENCE",
+        "episode_return": 90.0 * survival,
+        "return_survive": 100.0 * survival,
+        "return_overload": -1.0 / 3.0,
+        "return_cost": -5.0,
+        "cost_lsi": 0.0 if completed else 1.0,
+        "cost_tlo": 10.0,
+        "score_margin": 11.0,
+        "score_overload": -0.25,
+        "score_topology": -2.0,
+        "illegal": 1,
+        "ambiguous": 0,
+        "wall_time_s": 0.5,
+        "engine": "reference",
+        "scenario_pack_hash": "pack",
+        "action_set_hash": "actions",
+        "agent_hash": "",
+        "identity": "identity",
+    }
+    return Episode(**{**values, **changes})
+
+
+def result(agent: str, survivals: list[list[float]], heuristic: str | None = None, **identity: Any) -> EvaluationResult:
+    """Survivals by scenario, then seed."""
+    episodes = tuple(
+        episode(f"scenario {k}", seed, survival, agent=agent, heuristic=heuristic or "none")
+        for k, row in enumerate(survivals)
+        for seed, survival in enumerate(row)
+    )
+    words = {"task": TASK, "agent": agent, "heuristic": heuristic, "split": "validation", "versions": {"rl2grid": "0"}}
+    return EvaluationResult(episodes, {**words, **identity}, f"rl2grid evaluate {agent}")
+
+
+def curve(label: str = "ppo", seed: int = 0, n: int = 30) -> TrainingCurve:
+    decisions = 100.0 * np.arange(1, n + 1)
+    survival = np.clip(decisions / 3000 + np.random.default_rng(seed).normal(0, 0.1, n), 0, 1)
+    validated = slice(9, None, 10)
+    return TrainingCurve(
+        label, decisions, 12 * decisions, survival, decisions[validated], 12 * decisions[validated], survival[validated]
+    )
+
+
+def recording(n_steps: int = 700, n_line: int = 6, game_over: str = "the grid fell into several pieces") -> Recording:
+    random = np.random.default_rng(1)
+    rho = random.uniform(0.2, 0.9, (n_steps + 1, n_line)).astype(np.float32)
+    rho[-5:, 2] = 1.2
+    status = np.ones((n_steps + 1, n_line), np.bool_)
+    status[n_steps // 2 :, 1] = False
+    attacked = np.zeros_like(status)
+    attacked[n_steps // 2 : n_steps // 2 + 40, 1] = True
+    return Recording(
+        TASK,
+        "someone",
+        "idle",
+        "may",
+        0,
+        0,
+        2 * n_steps if game_over else n_steps,
+        game_over,
+        tuple(f"line {k}" for k in range(n_line)),
+        (3, n_steps // 2),
+        ("", "switch line 1"),
+        rho,
+        status,
+        attacked,
+        np.zeros_like(status),
+    )
