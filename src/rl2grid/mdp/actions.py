@@ -19,10 +19,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rl2grid.compile import jit
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
 from rl2grid.grids.rankings import ranking
-from rl2grid.compile import jit
 from rl2grid.mdp.state import GridState
 
 Kinds = NDArray[np.int8]

@@ -1,0 +1,1 @@
+"""Power flow: what every topology action would do to one snapshot of a grid."""
