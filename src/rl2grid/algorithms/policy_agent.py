@@ -1,0 +1,140 @@
+"""A trained policy as an agent: what the evaluation plays."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+
+from rl2grid.agents.agent import Action, Info, Observation
+from rl2grid.algorithms import ppo
+from rl2grid.algorithms.checkpoint import load_checkpoint
+from rl2grid.envs.normalization import ObservationNormalizer
+from rl2grid.envs.tasks import find_task
+from rl2grid.errors import UsageError
+from rl2grid.streams import Purpose, Stream
+
+BEST_FILE = "best.pt"
+"""In a run folder: the policy with the highest validation survival so far."""
+CHECKPOINT_FILE = "checkpoint.pt"
+"""In a run folder: everything needed to go on."""
+
+_NETWORKS = {"ppo": ppo.load_policy}
+
+
+class PolicyAgent:
+    """Plays a policy as it was when the checkpoint was written; neither it nor its statistics change any more."""
+
+    def __init__(self, contents: Mapping[str, Any], *, deterministic: bool = True, name: str | None = None) -> None:
+        """An agent from the sections of a checkpoint.
+
+        Args:
+            contents: See :mod:`rl2grid.algorithms.checkpoint`; ``training`` is not needed.
+            deterministic: Whether to play the most probable action instead of a sample.
+            name: What tables call the agent; by default the name of the algorithm.
+        """
+        policy = contents["policy"]
+        self.name = name or str(contents["algorithm"])
+        self.task: str = contents["task"]
+        self.env_keywords: dict[str, Any] = dict(contents["env_keywords"])
+        """Keywords of the environments that it was trained in: play it with the same ``heuristic`` and
+        ``normalize``, unless the difference is what is studied."""
+        self.deterministic = deterministic
+        self._network = _NETWORKS[contents["algorithm"]](policy)
+        self._mask_actions = bool(policy["mask_actions"])
+        self._normalizer: ObservationNormalizer | None = None
+        if policy["normalizer"] is not None:
+            self._normalizer = ObservationNormalizer(self._network.observation_size)
+            self._normalizer.load_state_dict(policy["normalizer"])
+            self._normalizer.freeze()
+        self._generator = torch.Generator().manual_seed(0)
+        self.identity: dict[str, Any] = {
+            "algorithm": contents["algorithm"],
+            "policy_hash": _hash(self._network),
+            "normaliser_hash": self._normalizer.normaliser_hash if self._normalizer else None,
+            "decisions": contents["decisions"],
+            "deterministic": deterministic,
+            "trained_with": dict(contents["identity"]),
+        }
+        """What a result of this agent must name beside the evaluation's own identity."""
+
+    def bind(self, env: gymnasium.Env[Any, Any]) -> None:
+        """Remember the environment, whose masks are asked for at every decision.
+
+        Raises:
+            UsageError: its observations or actions are not those that the policy was trained with.
+        """
+        base: Any = env.unwrapped
+        self._env = base
+        task = base.task.id
+        if task != self.task:
+            raise UsageError(f"The policy was trained on task {self.task!r} and cannot play task {task!r}.")
+        trained, offered = self.env_keywords.get("normalize", "physical"), base.options.normalize
+        if trained != offered:
+            raise UsageError(
+                f"The policy was trained with normalize={trained!r} and cannot read observations of "
+                f"normalize={offered!r}: make the environment with the former."
+            )
+        size = env.observation_space.shape
+        actions = env.action_space.shape[0] if self._network.continuous else env.action_space.n  # type: ignore
+        if size != (self._network.observation_size,) or actions != self._network.action_size:
+            raise UsageError(
+                f"The policy reads {self._network.observation_size} features and chooses among "
+                f"{self._network.action_size} actions, but the environment has {size} and {actions}: "
+                "the definition of the task has changed since it was trained."
+            )
+
+    def reset(self, i: int) -> None:
+        """Nothing to forget."""
+
+    def seed_episode(self, seed: int, episode: int) -> None:
+        """Draw samples from the stream (``seed``, ``episode``) from now on; without effect if deterministic."""
+        self._generator.manual_seed(Stream(seed, episode, Purpose.AGENT).integer(2**53))
+
+    def act(self, observation: Observation, info: Info) -> Action:
+        """The action for an observation: its id, or float32 [dimensions] in [-1, 1]."""
+        if self._normalizer is not None:
+            observation = self._normalizer.normalize(observation)
+        masks = torch.as_tensor(self._env.action_masks()).unsqueeze(0) if self._mask_actions else None
+        with torch.no_grad():
+            observations = torch.as_tensor(observation, dtype=torch.float32).unsqueeze(0)
+            actions = self._network.act(observations, masks, None if self.deterministic else self._generator)
+        if self._network.continuous:
+            return actions[0].clamp(-1.0, 1.0).numpy()
+        return int(actions[0])
+
+
+def load_agent(
+    path: Path, task_id: str | None = None, *, deterministic: bool = True, name: str | None = None
+) -> PolicyAgent:
+    """The policy of a checkpoint, or of a run folder (its best by validation, else its latest).
+
+    Args:
+        path: A checkpoint file or a run folder.
+        task_id: The task that it is to play; None: the one it was trained on.
+        deterministic: Whether to play the most probable action instead of a sample.
+        name: What tables call the agent; by default the name of the algorithm.
+
+    Raises:
+        UsageError: no checkpoint there, or one of another task.
+    """
+    path = Path(path)
+    if path.is_dir():
+        best = path / BEST_FILE
+        path = best if best.is_file() else path / CHECKPOINT_FILE
+    task = None if task_id is None else find_task(task_id).id
+    return PolicyAgent(load_checkpoint(path, task=task), deterministic=deterministic, name=name)
+
+
+def _hash(network: torch.nn.Module) -> str:
+    """Short SHA-256 of all weights."""
+    digest = hashlib.sha256()
+    for name, tensor in sorted(network.state_dict().items()):
+        digest.update(name.encode())
+        digest.update(np.ascontiguousarray(tensor.numpy()).tobytes())
+    return digest.hexdigest()[:16]
