@@ -1,0 +1,40 @@
+"""Agents by name, or from a checkpoint."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from rl2grid.agents.agent import Agent
+from rl2grid.agents.do_nothing import DoNothing
+from rl2grid.agents.random_agent import RandomAgent
+from rl2grid.agents.recovery import Recovery
+from rl2grid.errors import one_of
+
+AGENTS: dict[str, Callable[[], Agent]] = {
+    DoNothing.name: DoNothing,
+    RandomAgent.name: RandomAgent,
+    Recovery.name: Recovery,
+}
+"""Agents that need no training, by name."""
+
+
+def make_agent(spec: str | Path, task_id: str | None = None) -> Agent:
+    """The agent that ``spec`` asks for.
+
+    Args:
+        spec: a name of :data:`AGENTS`, or the path of a checkpoint or of a run folder.
+        task_id: the task that the agent is to play; checkpoints of other tasks are refused.
+
+    Raises:
+        UsageError: there is no such agent, or it cannot play the task.
+    """
+    if isinstance(spec, str) and spec in AGENTS:
+        return AGENTS[spec]()
+    path = Path(spec)
+    if not path.exists():
+        raise one_of("Agent", str(spec), (*AGENTS, "the path of a checkpoint", "the path of a run folder"))
+    # Imported here: agents without training run without torch.
+    from rl2grid.algorithms.policy_agent import load_agent
+
+    return load_agent(path, task_id)

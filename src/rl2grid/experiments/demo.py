@@ -1,0 +1,131 @@
+"""The demonstration: train, evaluate beside simple agents, and write a report, in a few minutes.
+
+Everything is written below one folder. The demonstration may be interrupted and started again: a
+training goes on from its checkpoint, an evaluation with the episodes that are missing.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+import gymnasium
+from rich.console import Console
+
+from rl2grid.analysis.recordings import Recording
+from rl2grid.analysis.report import write_report
+from rl2grid.analysis.results import EvaluationResult
+from rl2grid.analysis.tables import rich_table
+from rl2grid.analysis.training import read_training_curve
+from rl2grid.envs.registration import register_all
+from rl2grid.errors import UsageError
+from rl2grid.experiments import runs
+from rl2grid.experiments.agents import make_agent
+from rl2grid.experiments.evaluation import evaluate, validator
+from rl2grid.experiments.recording import record_episode
+from rl2grid.scenarios.library import list_scenarios
+
+TASK = "rl2grid/bus14-T0-v0"
+HEURISTIC = "idle"
+DECISIONS = 10_240
+"""Enough to pass doing nothing; a longer training goes further."""
+SEEDS = (0, 1, 2)
+"""Of maintenance and of the random agent: episodes per test scenario."""
+
+
+def run_demo(output: Path, decisions: int | None = None, workers: int | None = None) -> Path:
+    """Train PPO with the idle heuristic on bus14, evaluate it on held-out months, write a report.
+
+    Args:
+        output: folder of the report, ``report.html`` in it; ``output / "run"`` holds the training.
+        decisions: how long to train.
+        workers: processes; None: one per processor core.
+
+    Returns:
+        The report.
+
+    Raises:
+        UsageError: ``decisions`` is too small, or ``output`` holds a training of another length.
+    """
+    console, began = Console(), time.perf_counter()
+    register_all()
+    workers = (os.cpu_count() or 1) if workers is None else workers
+    console.rule("1/4 Training PPO with the idle heuristic on bus14", align="left")
+    console.print("Whenever a line is loaded to 95%, the agent chooses one of 50 topology actions.")
+    run = _train(output / "run", DECISIONS if decisions is None else decisions, workers)
+
+    console.rule("2/4 Playing two months that no agent has seen", align="left")
+    results = [_evaluate(agent, heuristic, output, workers) for agent, heuristic in _contestants(run)]
+
+    console.rule("3/4 Recording one episode", align="left")
+    recording = _record(run)
+
+    console.rule("4/4 Writing the report", align="left")
+    report = write_report(
+        output,
+        results,
+        title="PPO on bus14",
+        introduction=(
+            "An agent that acts only when a line is loaded to 95%, trained for minutes, beside doing nothing and "
+            "acting at random, on two months that none of them has seen."
+        ),
+        curves=[read_training_curve(run, "PPO with the idle heuristic")],
+        recordings=[recording],
+        commands={"training": "rl2grid demo", "episodes": "rl2grid demo"},
+    )
+    console.print(rich_table([result.summary for result in results], title=f"{TASK}, test scenarios"))
+    console.print(f"Report: {report} ({time.perf_counter() - began:.0f} s)")
+    return report
+
+
+def _contestants(run: Path) -> list[tuple[str, str | None]]:
+    return [("do-nothing", None), ("random", HEURISTIC), (str(run), HEURISTIC)]
+
+
+def _train(folder: Path, decisions: int, workers: int) -> Path:
+    """Begin the run, or go on with it; a complete run is left as it is."""
+    hyperparameters = runs.hyperparameters("ppo", TASK, total_timesteps=decisions)
+    # In this process: validation on bus14 takes less time than starting workers for it.
+    evaluate_policy = validator(TASK, heuristic=HEURISTIC)
+    if folder.exists():
+        stored, _ = runs.read_config(folder)
+        if stored.hyperparameters != hyperparameters:
+            raise UsageError(f"{folder} holds another training: remove it, or choose another folder with --output.")
+        return runs.resume(folder, evaluate=evaluate_policy)
+    args = runs.RunArgs(
+        task=TASK,
+        hyperparameters=hyperparameters,
+        folder=folder,
+        env_keywords={"heuristic": HEURISTIC},
+        num_workers=workers,
+        evaluate_every=max(decisions // 8, 1),
+    )
+    return runs.train(args, evaluate=evaluate_policy)
+
+
+def _evaluate(agent: str, heuristic: str | None, output: Path, workers: int) -> EvaluationResult:
+    name = agent if agent in ("do-nothing", "random") else "PPO"
+    return evaluate(
+        agent,
+        TASK,
+        split="test",
+        seeds=SEEDS,
+        heuristic=heuristic,
+        workers=workers,
+        output=output / "evaluation" / name,
+        progress=True,
+        name=name,
+        command=f"rl2grid evaluate {agent} {TASK} --split test --seeds {len(SEEDS)} --heuristic {heuristic}",
+    )
+
+
+def _record(run: Path) -> Recording:
+    scenario = list_scenarios("bus14", "test")[-1]
+    env = gymnasium.make(TASK, split="test", heuristic=HEURISTIC, disable_env_checker=True)
+    try:
+        agent = make_agent(run, TASK)
+        agent.bind(env)
+        return record_episode(agent, env, scenario=scenario)
+    finally:
+        env.close()
