@@ -1,0 +1,171 @@
+"""``rl2grid train <algorithm> <task>``: a training run in a folder of its own, resumable at any moment."""
+
+from __future__ import annotations
+
+import contextlib
+import difflib
+import io
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import Field, dataclass, fields, make_dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rl2grid.envs.tasks import TaskOptions, find_task
+from rl2grid.errors import UsageError, one_of
+
+if TYPE_CHECKING:
+    from rl2grid.algorithms.policy_agent import PolicyAgent
+    from rl2grid.algorithms.ppo import Args
+
+_HELP = """\
+usage: rl2grid train <algorithm> <task> [flags]
+       rl2grid train --resume <run folder>
+
+Trains an algorithm (ppo) on a task (see `rl2grid tasks`) and writes a run folder: configuration, metrics.csv,
+tensorboard/, checkpoint.pt, best.pt by validation survival, log.txt. A run that was interrupted goes on with
+--resume. Flags and their defaults with --help after the task, for example `rl2grid train ppo bus14-T0 --help`.
+"""
+
+
+@dataclass(frozen=True)
+class TrainFlags:
+    """How the run is made; the algorithm's hyperparameters are flags as well."""
+
+    preset: str = "default"
+    """Hyperparameters to start from: ``default`` or ``paper``; single flags replace single values."""
+    folder: Path | None = None
+    """Run folder, which must not exist yet; None: runs/<task>-<algorithm>-<seed>."""
+    heuristic: str | None = None
+    """What plays while the grid is safe: None, ``idle`` or ``recovery``."""
+    reward: str = "default"
+    """Reward preset: ``default``, ``paper`` or ``released``."""
+    dispatch: str = "exact"
+    """``exact`` or ``grid2op``."""
+    maintenance: bool = True
+    """Whether planned maintenance happens."""
+    opponent: bool = True
+    """Whether the grid's opponent attacks."""
+    num_workers: int | None = None
+    """Processes that play the environments; None: one per processor core. No influence on results."""
+    evaluate_every: int = 50_000
+    """Decisions between two evaluations on the validation scenarios."""
+    validate: bool = True
+    """Whether the best policy is picked on the validation scenarios."""
+    checkpoint_seconds: float = 60.0
+    """A checkpoint is written when the last one is older than this, and at the end."""
+
+
+def train(command_line: list[str]) -> int:
+    """Run the subcommand.
+
+    Raises:
+        UsageError: the request cannot be met; nothing was written.
+    """
+    if not command_line or command_line[0] in ("-h", "--help"):
+        print(_HELP)
+        return 0
+    if command_line[0] == "--resume":
+        return _resume(command_line[1:])
+    if len(command_line) < 2 or command_line[1].startswith("-"):
+        raise UsageError("Training needs an algorithm and a task, for example `rl2grid train ppo bus14-T0`.")
+    algorithm, task, flags = command_line[0], command_line[1], command_line[2:]
+    return _begin(algorithm, task, flags)
+
+
+def _resume(arguments: list[str]) -> int:
+    if len(arguments) != 1:
+        raise UsageError("Resuming needs one run folder, for example `rl2grid train --resume runs/bus14-T0-v0-ppo-1`.")
+    from rl2grid.experiments import runs
+
+    args, _ = runs.read_config(Path(arguments[0]))
+    folder = runs.resume(Path(arguments[0]), evaluate=_validator(args.task, args.num_workers))
+    print(f"Run complete: {folder}.")
+    return 0
+
+
+def _begin(algorithm: str, task_id: str, flags: list[str]) -> int:
+    task = find_task(task_id)
+    try:
+        from rl2grid.experiments import runs
+    except ImportError as error:
+        raise UsageError(f"Training needs {error.name}: install it with `pip install rl2grid[train]`.") from None
+    if algorithm not in runs.ALGORITHMS:
+        raise one_of("Algorithm", algorithm, tuple(runs.ALGORITHMS))
+    chosen = runs.ALGORITHMS[algorithm]
+    hyperparameters = runs.hyperparameters(algorithm, task.id, _preset(flags))
+    _refuse_unknown(flags, [*fields(TrainFlags), *fields(chosen.args)])
+    own, hyperparameters = _parse(f"rl2grid train {algorithm} {task.id}", flags, hyperparameters)
+    keywords = {name: getattr(own, name) for name in ("heuristic", "reward", "dispatch", "maintenance", "opponent")}
+    TaskOptions(**keywords)
+    args = runs.RunArgs(
+        task=task.id,
+        hyperparameters=hyperparameters,
+        algorithm=algorithm,
+        folder=own.folder,
+        env_keywords=keywords,
+        num_workers=own.num_workers,
+        checkpoint_seconds=own.checkpoint_seconds,
+        evaluate_every=own.evaluate_every,
+    )
+    folder = runs.train(args, evaluate=_validator(task.id, own.num_workers) if own.validate else None)
+    print(f"Run complete: {folder}. Evaluate it with `rl2grid evaluate {folder} {task.id} --split test`.")
+    return 0
+
+
+def _preset(flags: list[str]) -> str:
+    for flag, value in zip(flags, [*flags[1:], ""], strict=True):
+        if flag == "--preset":
+            return value
+        if flag.startswith("--preset="):
+            return flag.removeprefix("--preset=")
+    return "default"
+
+
+def _parse(program: str, flags: list[str], hyperparameters: Args) -> tuple[TrainFlags, Args]:
+    """The flags of the run and of the algorithm, in one list."""
+    import tyro
+
+    request = make_dataclass(
+        "Request",
+        [
+            ("flags", tyro.conf.OmitArgPrefixes[TrainFlags]),
+            ("hyperparameters", tyro.conf.OmitArgPrefixes[type(hyperparameters)]),  # type: ignore[misc]
+        ],
+    )
+    complaint = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(complaint):
+            parsed = tyro.cli(request, prog=program, args=flags, default=request(TrainFlags(), hyperparameters))
+    except SystemExit as stop:
+        if not stop.code:
+            raise  # --help was asked for
+        raise UsageError(f"{_sentence(complaint.getvalue())}; see {program} --help.") from None
+    return parsed.flags, parsed.hyperparameters
+
+
+def _sentence(box: str) -> str:
+    """What a parser says in a box of several lines, as one sentence without its full stop."""
+    lines = [line.strip(" \u2502|") for line in box.splitlines()]
+    text = [line for line in lines if line and line[0] not in "-\u2500\u256d\u2570"]
+    begin = next((k for k, line in enumerate(text) if line.startswith("Error parsing")), 0)
+    end = next((k for k, line in enumerate(text) if line.startswith(("Argument helptext", "For full helptext"))), None)
+    return " ".join(text[begin:end]).removesuffix(".")
+
+
+def _refuse_unknown(flags: list[str], known: list[Field[Any]]) -> None:
+    names = {"--help", *(f"--{field.name.replace('_', '-')}" for field in known)}
+    names |= {f"--no-{field.name.replace('_', '-')}" for field in known if field.type == "bool"}
+    for flag in flags:
+        name = flag.split("=", 1)[0].replace("_", "-")
+        if not flag.startswith("--") or name in names:
+            continue
+        close = difflib.get_close_matches(name, sorted(names), n=3)
+        hint = f"did you mean {' or '.join(close)}?" if close else "see --help after the task for all flags."
+        raise UsageError(f"Flag {name} does not exist: {hint}")
+
+
+def _validator(task_id: str, workers: int | None) -> Callable[[PolicyAgent], Mapping[str, float]]:
+    from rl2grid.experiments.evaluation import validator
+
+    return validator(task_id, workers=(os.cpu_count() or 1) if workers is None else workers)

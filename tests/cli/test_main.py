@@ -1,0 +1,76 @@
+"""The command line: what it prints, and how it refuses."""
+
+import subprocess
+import sys
+
+import pytest
+
+from rl2grid.cli.main import main
+
+
+def refused(capsys, *command_line):
+    """The one sentence with which a command line is refused."""
+    assert main(command_line) == 2
+    captured = capsys.readouterr()
+    (sentence,) = captured.err.strip().splitlines()
+    assert sentence.startswith("rl2grid: ")
+    assert sentence.endswith((".", "?"))
+    return sentence
+
+
+def test_tasks_lists_all_with_their_sizes(capsys):
+    assert main(["tasks"]) == 0
+    output = capsys.readouterr().out
+    assert "103 tasks" in output
+    assert "73,357 discrete" in output
+    assert "69 continuous" in output
+    assert "multi-area opponent" in output
+
+
+def test_tasks_of_one_grid(capsys):
+    assert main(["tasks", "--grid", "bus14"]) == 0
+    output = capsys.readouterr().out
+    assert "7 tasks" in output
+    assert "bus36" not in output
+
+
+@pytest.mark.parametrize(
+    ("command_line", "part"),
+    [
+        (["tasks", "--grid", "bus15"], "choose one of bus14, bus36-M"),
+        (["frobnicate"], "choose from 'demo', 'tasks'"),
+        (["tasks", "--grids", "bus14"], "--grids"),
+        (["train", "ppo"], "needs an algorithm and a task"),
+        (["train", "td4", "bus14-T0"], "Algorithm 'td4' does not exist: choose one of ppo"),
+        (["train", "ppo", "bus14-T7"], "with level 0, 1"),
+        (["train", "ppo", "bus14-T0", "--sede", "3"], "Flag --sede does not exist: did you mean --seed"),
+        (["train", "ppo", "bus14-T0", "--preset", "best"], "choose one of default, paper"),
+        (["train", "ppo", "bus14-T0", "--heuristic", "lazy"], "choose one of None, idle, recovery"),
+        (["train", "ppo", "bus14-T0", "--num-envs", "0"], "num_envs of at least 1"),
+        (["train", "--resume", "no-such-run"], "holds no run"),
+        (["evaluate", "genius", "bus14-T0"], "choose one of do-nothing, random, recovery"),
+        (["evaluate", "do-nothing", "bus99-T0"], "with a grid of bus14"),
+        (["evaluate", "do-nothing", "bus14-T0", "--split", "dev"], "choose from 'train', 'validation'"),
+        (["evaluate", "do-nothing", "bus14-T0", "--seeds", "0"], "seeds"),
+        (["rank", "bus15", "--provisional"], "choose one of bus14"),
+        (["rank", "bus14", "--provisional", "--states", "0"], "at least 1"),
+    ],
+)
+def test_refusals_are_one_sentence_with_what_is_allowed(capsys, tmp_path, monkeypatch, command_line, part):
+    monkeypatch.chdir(tmp_path)
+    assert part in refused(capsys, *command_line)
+    assert not list(tmp_path.iterdir()), "a refused command must write nothing"
+
+
+def test_help_of_training_lists_hyperparameters_with_their_meaning(capsys):
+    with pytest.raises(SystemExit) as exit_:
+        main(["train", "ppo", "bus14-T0", "--help"])
+    assert exit_.value.code == 0
+    output = capsys.readouterr().out
+    assert "--clip-coefficient" in output
+    assert "--heuristic" in output
+
+
+def test_works_as_a_module_and_says_its_version():
+    command = [sys.executable, "-m", "rl2grid.cli", "--version"]
+    assert subprocess.run(command, capture_output=True, text=True, check=True).stdout.startswith("rl2grid 0.")
