@@ -281,6 +281,15 @@ def test_an_interrupt_ends_the_run_after_the_iteration_and_it_can_be_resumed(tmp
     assert_same_run(folder, straight)
 
 
+@pytest.fixture
+def interruptible():
+    """A process in the background of a shell begins with interrupts ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
 def test_a_second_interrupt_ends_the_run_at_once(tmp_path: Path):
     class Interrupting(ToyGrid):
         def step(self, actions: Any) -> Any:

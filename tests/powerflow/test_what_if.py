@@ -147,9 +147,9 @@ def test_what_if_equals_a_plain_solution_of_each_topology(case):
         tried = np.concatenate(
             (
                 [0],
-                rng.choice(len(catalogue), 30),
-                rng.choice(at_split, 20) if len(at_split) else [],
-                rng.choice(switches, 15),
+                rng.choice(len(catalogue), 15),
+                rng.choice(at_split, 10) if len(at_split) else [],
+                rng.choice(switches, 8),
                 switches[snapshot.v_or <= 0],
             )
         ).astype(int)

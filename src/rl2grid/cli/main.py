@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import NoReturn
 
 from rl2grid import __version__
+from rl2grid.cli.train import INTERRUPTED, train
 from rl2grid.envs.tasks import HEURISTICS, SPLITS
 from rl2grid.errors import UsageError
 
-INTERRUPTED = 130
 REFUSED = 2
 
 
@@ -54,8 +54,6 @@ def _run(command_line: list[str]) -> int:
     _add_evaluate(commands)
     _add_rank(commands)
     if command_line[:1] == ["train"]:
-        from rl2grid.cli.train import train
-
         return train(command_line[1:])
     options = parser.parse_args(command_line)
     if options.command is None:

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from rl2grid.algorithms.policy_agent import PolicyAgent
     from rl2grid.algorithms.ppo import Args
 
+INTERRUPTED = 130
+"""Exit status after an interrupt, as shells have it."""
+
 _HELP = """\
 usage: rl2grid train <algorithm> <task> [flags]
        rl2grid train --resume <run folder>
@@ -80,8 +83,7 @@ def _resume(arguments: list[str]) -> int:
 
     args, _ = runs.read_config(Path(arguments[0]))
     folder = runs.resume(Path(arguments[0]), evaluate=_validator(args.task, args.num_workers))
-    print(f"Run complete: {folder}.")
-    return 0
+    return _report(folder, args.task)
 
 
 def _begin(algorithm: str, task_id: str, flags: list[str]) -> int:
@@ -109,7 +111,16 @@ def _begin(algorithm: str, task_id: str, flags: list[str]) -> int:
         evaluate_every=own.evaluate_every,
     )
     folder = runs.train(args, evaluate=_validator(task.id, own.num_workers) if own.validate else None)
-    print(f"Run complete: {folder}. Evaluate it with `rl2grid evaluate {folder} {task.id} --split test`.")
+    return _report(folder, task.id)
+
+
+def _report(folder: Path, task_id: str) -> int:
+    from rl2grid.experiments import runs
+
+    if not runs.is_finished(folder):
+        print(f"Run stopped: {folder}. Go on with `rl2grid train --resume {folder}`.")
+        return INTERRUPTED
+    print(f"Run complete: {folder}. Evaluate it with `rl2grid evaluate {folder} {task_id} --split test`.")
     return 0
 
 

@@ -54,6 +54,8 @@ def run_demo(output: Path, decisions: int | None = None, workers: int | None = N
     console.rule("1/4 Training PPO with the idle heuristic on bus14", align="left")
     console.print("Whenever a line is loaded to 95%, the agent chooses one of 50 topology actions.")
     run = _train(output / "run", DECISIONS if decisions is None else decisions, workers)
+    if not runs.is_finished(run):
+        raise KeyboardInterrupt
 
     console.rule("2/4 Playing two months that no agent has seen", align="left")
     results = [_evaluate(agent, heuristic, output, workers) for agent, heuristic in _contestants(run)]

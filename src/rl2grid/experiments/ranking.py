@@ -11,7 +11,7 @@
 4. Relief of an action in a snapshot is the decrease of the worst loading it brings, within [-1, 1]; -1
    for a collapse, 0 where the rules forbid the action. Its share is its relief, if positive, over the
    largest relief that any action brings there. The first actions, those of levels 0 and 1, are chosen
-   one by one to cover the snapshots; each maximises
+   one by one to cover the snapshots, each by more than one action; each choice maximises
 
        sum over snapshots of 0.7 · share · (what is left of the snapshot)
            - 0.02 · collapses + 0.001 · total relief,

@@ -28,6 +28,9 @@ SPLITS = ("train", "validation", "test", "bundled")
 """``train`` teaches, ``validation`` picks models, ``test`` has the final word, ``bundled`` is every bundled series."""
 
 SOURCES = ("bundled", "full")
+
+GENERATOR_VERSION: str | None = None
+"""Version of what generated the scenarios, named by every result; None: all scenarios are recorded ones."""
 _ID = re.compile(r"(?P<source>\w+)/(?P<series>[^\[\]]+)(\[(?P<start>\d+):(?P<stop>\d+)\])?")
 
 
