@@ -14,8 +14,9 @@ from typing import NoReturn
 
 from rl2grid import __version__
 from rl2grid.cli.train import INTERRUPTED, train
-from rl2grid.envs.tasks import HEURISTICS, SPLITS
+from rl2grid.engines import HEURISTICS
 from rl2grid.errors import UsageError
+from rl2grid.scenarios.library import SPLITS
 
 REFUSED = 2
 
@@ -97,7 +98,7 @@ def _add_evaluate(commands: argparse._SubParsersAction[_Parser]) -> None:
     parser.add_argument("task", help="for example bus14-T0")
     parser.add_argument("--split", default="validation", choices=SPLITS, help="validation picks models; test is last")
     parser.add_argument("--seeds", type=int, default=1, help="episodes per scenario, with seeds 0, 1, ...")
-    parser.add_argument("--heuristic", default=None, choices=HEURISTICS, help="by default the agent's own")
+    parser.add_argument("--heuristic", default=None, choices=("None", *HEURISTICS), help="by default the agent's own")
     parser.add_argument("--workers", type=int, default=None, help="processes; by default one per core")
     parser.add_argument("--output", type=Path, default=None, help="folder of the results")
     parser.set_defaults(run=_evaluate)

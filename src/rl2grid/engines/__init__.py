@@ -1,1 +1,10 @@
 """The simulators that play the decision process."""
+
+ENGINES: tuple[str, ...] = ("reference",)
+"""Engines by name; ``reference`` is Grid2Op with LightSim2Grid."""
+
+HEURISTICS: tuple[str, ...] = ("idle", "recovery")
+"""What may play while the grid is safe; without one, the agent decides every step."""
+
+DISPATCHES: tuple[str, ...] = ("exact", "grid2op")
+"""How the redispatch problem of a step is solved; see ``docs/dispatch.md``."""

@@ -9,9 +9,6 @@ from rl2grid.mdp.actions import StepAction
 from rl2grid.mdp.state import GridState
 from rl2grid.scenarios.episodes import EpisodePlan
 
-DISPATCHES: tuple[str, ...] = ("exact", "grid2op")
-"""How the redispatch problem of a step is solved; see ``docs/dispatch.md``."""
-
 
 class Engine(Protocol):
     """Simulator of several independent environments of one grid.

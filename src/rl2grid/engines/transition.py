@@ -18,9 +18,6 @@ from rl2grid.mdp.rewards import RewardFunction
 from rl2grid.mdp.state import GridState
 from rl2grid.scenarios.episodes import EpisodePlan
 
-HEURISTICS: tuple[str | None, ...] = (None, "idle", "recovery")
-"""What plays while the grid is safe; None: the agent decides every step."""
-
 Listener = Callable[[GridState, int], None]
 """Called after every grid step with the state and the environment's row."""
 
@@ -31,6 +28,7 @@ class Transitions:
 
     engine: Engine
     heuristic: str | None
+    """One of :data:`rl2grid.engines.HEURISTICS`; None: the agent decides every step."""
     topology_task: bool
     """On continuous tasks the recovery heuristic only reconnects lines."""
     reward: RewardFunction

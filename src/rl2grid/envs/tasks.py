@@ -7,18 +7,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from rl2grid.engines import DISPATCHES, ENGINES, HEURISTICS
 from rl2grid.errors import UsageError, one_of
 from rl2grid.grids import GRID_IDS, Grid, load_grid
+from rl2grid.scenarios.library import SPLITS
 
 VERSION = 0
 """Version of every id; raised when anything that defines a result changes."""
 
 CONSTRAINTS: tuple[str, ...] = ("LSI", "TLO")
-ENGINES: tuple[str, ...] = ("reference",)
-HEURISTICS: tuple[str, ...] = ("None", "idle", "recovery")
-SPLITS: tuple[str, ...] = ("train", "validation", "test", "bundled")
-DISPATCHES: tuple[str, ...] = ("exact", "grid2op")
-NORMALIZATIONS: tuple[str, ...] = ("physical", "None")
 
 
 @dataclass(frozen=True)
@@ -127,9 +124,9 @@ class TaskOptions:
 
     def __post_init__(self) -> None:
         _check("engine", self.engine, ENGINES)
-        _check("heuristic", self.heuristic, HEURISTICS)
+        _check("heuristic", self.heuristic, ("None", *HEURISTICS))
         _check("split", self.split, SPLITS)
-        _check("normalize", self.normalize, NORMALIZATIONS)
+        _check("normalize", self.normalize, ("physical", "None"))
         _check("dispatch", self.dispatch, DISPATCHES)
         _check("constraint", self.constraint, ("None", *CONSTRAINTS))
         if self.gamma is not None and not (isinstance(self.gamma, int | float) and 0 <= self.gamma <= 1):

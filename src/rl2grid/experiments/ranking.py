@@ -198,7 +198,7 @@ class _Laboratory:
     @property
     def environment(self) -> Any:
         """The Grid2Op environment behind the engine."""
-        return self.engine._environments[0]
+        return self.engine.grid2op_environment(0)
 
     def close(self) -> None:
         self.engine.close()

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from rl2grid.engines.base import DISPATCHES
+from rl2grid.engines import DISPATCHES
 from rl2grid.errors import UsageError, one_of
 from rl2grid.grids import Grid
 from rl2grid.mdp.actions import ActionKind, StepAction, decode_continuous, moved_elements
@@ -137,6 +137,10 @@ class ReferenceEngine:
         else:
             self._read(result, 0, simulated)
         return result
+
+    def grid2op_environment(self, i: int) -> Any:
+        """The ``grid2op.Environment`` behind environment ``i``."""
+        return self._environments[i]
 
     def close(self) -> None:
         """Close the Grid2Op environments."""
