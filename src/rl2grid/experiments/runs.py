@@ -5,7 +5,7 @@ A run folder holds
 - ``config.json``: the request, its identity (versions, hashes) and its seeds;
 - ``metrics.csv`` and ``tensorboard/``: see :mod:`rl2grid.algorithms.metrics`;
 - ``checkpoint.pt``: everything needed to go on, see :mod:`rl2grid.algorithms.checkpoint`;
-- ``best.pt``: the policy with the highest validation survival so far;
+- ``best.pt``: the policy with the highest validation survival so far, the latest of equals;
 - ``log.txt``: what happened when.
 
 A run that was interrupted and resumed any number of times ends with the same weights, bit for bit, and
@@ -271,7 +271,8 @@ class _Run:
         contents = self.contents()
         result = self.evaluate(PolicyAgent(contents))
         survival = float(result["survival"])
-        if self.best_survival is None or survival > self.best_survival:
+        # Of equally good policies the latest: it has learned from more than the validation scenarios show.
+        if self.best_survival is None or survival >= self.best_survival:
             self.best_survival = survival
             save_checkpoint(self.folder / BEST_FILE, {**contents, "run": {"survival": survival}})
             self.note(f"best validation survival {survival:.4f} after {self.trainer.decisions} decisions")
