@@ -14,11 +14,12 @@ from rl2grid.engines.reference import engine as engine_module
 from rl2grid.engines.reference.engine import ReferenceEngine
 from rl2grid.grids import GRID_IDS, load_grid
 from rl2grid.mdp.actions import ActionKind, StepAction, continuous_layout, full_catalogue
+from rl2grid.mdp.state import OBSERVED, OBSERVED_STORAGE
 from rl2grid.mdp.termination import GameOver
 from rl2grid.scenarios.episodes import EpisodePlan
 from rl2grid.scenarios.library import list_scenarios, load_scenario
 
-ATTRIBUTES = (*engine_module._OBSERVED, *engine_module._OBSERVED_STORAGE)
+ATTRIBUTES = (*OBSERVED, *OBSERVED_STORAGE)
 
 
 def plain_environment(grid):

@@ -105,13 +105,18 @@ def serve(requests: BinaryIO, answers: BinaryIO) -> None:
         rows.close()
 
 
-def main() -> None:
-    """Serve on the standard streams; what a library prints goes to the standard error instead."""
+def take_standard_streams() -> tuple[BinaryIO, BinaryIO]:
+    """Where a worker process reads requests and writes answers; what a library prints goes to the standard error."""
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     # An interrupt from the keyboard reaches the whole group: the parent decides when workers end.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    serve(sys.stdin.buffer, answers)
+    return sys.stdin.buffer, answers
+
+
+def main() -> None:
+    """Serve on the standard streams."""
+    serve(*take_standard_streams())
 
 
 if __name__ == "__main__":

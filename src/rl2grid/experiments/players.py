@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import pickle
 import queue
-import signal
 import subprocess
 import sys
 import threading
@@ -25,6 +24,7 @@ import gymnasium
 
 from rl2grid.agents.agent import Agent
 from rl2grid.envs.registration import register_all
+from rl2grid.envs.worker import take_standard_streams
 from rl2grid.errors import UsageError
 from rl2grid.experiments.agents import make_agent
 from rl2grid.experiments.episode import PlayedEpisode, play_episode
@@ -275,13 +275,5 @@ def serve(requests: BinaryIO, answers: BinaryIO) -> None:
 
 
 def main() -> None:
-    """Serve on the standard streams; what a library prints goes to the standard error instead."""
-    answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-    # An interrupt from the keyboard reaches the whole group: the parent decides when workers end.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    serve(sys.stdin.buffer, answers)
-
-
-if __name__ == "__main__":
-    main()
+    """Serve on the standard streams."""
+    serve(*take_standard_streams())

@@ -181,6 +181,10 @@ _FLOATS = (
     "storage_theta",
 )
 _CONSTANTS = GridState._fields[: GridState._fields.index("gen_p")]
+OBSERVED = GridState._fields[GridState._fields.index("gen_p") : GridState._fields.index("storage_charge")]
+"""Attributes of Grid2Op's observation, those of storage excepted."""
+OBSERVED_STORAGE = GridState._fields[GridState._fields.index("storage_charge") : GridState._fields.index("step")]
+"""Attributes of Grid2Op's observation on grids with storage."""
 
 
 def new_state(grid: Grid, n: int) -> GridState:

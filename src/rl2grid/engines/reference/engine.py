@@ -18,7 +18,7 @@ from rl2grid.errors import UsageError, one_of
 from rl2grid.grids import Grid
 from rl2grid.mdp.actions import ActionKind, StepAction, decode_continuous, moved_elements
 from rl2grid.mdp.opponents import draw_opponent, load_draws, new_opponent_state
-from rl2grid.mdp.state import GridState, new_state
+from rl2grid.mdp.state import OBSERVED, OBSERVED_STORAGE, GridState, new_state
 from rl2grid.mdp.termination import GameOver, game_over_reason
 from rl2grid.scenarios.episodes import EpisodePlan, maintenance_matrix
 from rl2grid.scenarios.library import list_scenarios, load_scenario
@@ -38,31 +38,6 @@ from rl2grid.engines.reference.chronics import ScenarioChronics
 from rl2grid.engines.reference.dispatch import ExactRedispatchSolver, redispatch_is_impossible
 from rl2grid.engines.reference.opponent import install_opponent
 
-_OBSERVED = (
-    "gen_p",
-    "gen_theta",
-    "load_p",
-    "load_theta",
-    "p_or",
-    "a_or",
-    "rho",
-    "line_status",
-    "topo_vect",
-    "timestep_overflow",
-    "time_before_cooldown_line",
-    "time_before_cooldown_sub",
-    "time_next_maintenance",
-    "duration_next_maintenance",
-    "target_dispatch",
-    "actual_dispatch",
-    "gen_margin_up",
-    "gen_margin_down",
-    "gen_p_before_curtail",
-    "curtailment",
-    "curtailment_limit",
-)
-_OBSERVED_STORAGE = ("storage_charge", "storage_power_target", "storage_power", "storage_theta")
-
 
 class ReferenceEngine:
     """``n`` Grid2Op environments of one grid; see :class:`rl2grid.engines.base.Engine`."""
@@ -78,7 +53,7 @@ class ReferenceEngine:
         self._environments = self._make_environments(n)
         self._do_nothing = [environment.action_space() for environment in self._environments]
         self._observations: list[Any] = [None] * n
-        self._observed = (*_OBSERVED, *_OBSERVED_STORAGE) if grid.n_storage else _OBSERVED
+        self._observed = (*OBSERVED, *OBSERVED_STORAGE) if grid.n_storage else OBSERVED
 
     def reset(self, i: int, plan: EpisodePlan) -> None:
         """Begin the episode ``plan`` in environment ``i``."""
@@ -179,7 +154,7 @@ class ReferenceEngine:
             state.attacked[i] = False  # the opponent's turn never came
         else:
             state.game_over[i] = game_over_reason(state, i)
-        for name in (*_OBSERVED, *_OBSERVED_STORAGE):
+        for name in (*OBSERVED, *OBSERVED_STORAGE):
             getattr(state, name)[i] = 0
         state.topo_vect[i] = -1
         state.time_next_maintenance[i] = -1
