@@ -222,7 +222,11 @@ def load_grid(grid_id: str) -> Grid:
 
 @functools.cache
 def _load(grid_id: str) -> Grid:
-    record = json.loads(_file_bytes(grid_id))
+    return grid_from_record(json.loads(_file_bytes(grid_id)))
+
+
+def grid_from_record(record: dict[str, Any]) -> Grid:
+    """The grid that the plain values of a JSON file describe; its arrays are read-only."""
     hints = get_type_hints(Grid)
     values: dict[str, Any] = {}
     for field in fields(Grid):

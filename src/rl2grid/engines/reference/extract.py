@@ -1,7 +1,8 @@
-"""Write the grid data of :mod:`rl2grid.grids` from live Grid2Op environments.
+"""Read live Grid2Op environments into the records that :mod:`rl2grid.grids` and its networks are made of.
 
-``python -m rl2grid.engines.reference.extract`` rewrites ``src/rl2grid/grids/data/*.json``;
-``tests/grids/test_grid.py`` calls :func:`describe_environment` and compares.
+``python -m rl2grid.engines.reference.extract`` rewrites ``src/rl2grid/grids/data/*.json``, two files per grid:
+``<grid>.json`` (:func:`describe_environment`) and ``<grid>.network.json`` (:func:`describe_network`).
+``tests/grids/test_grid.py`` and ``tests/powerflow/test_model.py`` compare them with live environments.
 """
 
 from __future__ import annotations
@@ -12,9 +13,12 @@ import os
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+
+from rl2grid.powerflow.model import read_network_record
 
 
 @dataclass(frozen=True)
@@ -50,12 +54,34 @@ SOURCES: dict[str, Source] = {
     "bus118-MOB-v1": Source("l2rpn_idf_2023", ("l2rpn_idf_2023",), (50, 309, 1915, 11852, 73357)),
 }
 
-_BUS14_MAINTENANCE_LINES = (0, 4, 5, 10, 14)
-"""Lines of bus14 that are maintained: Table 1 of the paper gives bus14 maintenance, the wheel none.
+_BUS14_MAINTENANCE: dict[str, Any] = {
+    "lines": (0, 4, 5, 10, 14),
+    "monthly_daily_probability": [0.02] * 12,
+    "monthly_max_per_day": [1] * 12,
+    "start_hour": 9,
+    "end_hour": 17,
+}
+"""Table 1 of the paper gives bus14 maintenance, the wheel none.
 
-These are the lines whose outage from 9 to 17 h leaves at least nine of ten working days of the four real
+The lines are those whose outage from 9 to 17 h leaves at least nine of ten working days of the four real
 months without a further trip or a collapse, when nothing else is done.
 """
+
+_NO_MAINTENANCE: dict[str, Any] = {
+    "lines": [],
+    "monthly_daily_probability": [0.0] * 12,
+    "monthly_max_per_day": [0] * 12,
+    "start_hour": 9,
+    "end_hour": 17,
+}
+
+OPPONENT_KINDS = {
+    "BaseOpponent": "none",
+    "WeightedRandomOpponent": "weighted",
+    "GeometricOpponent": "geometric",
+    "GeometricOpponentMultiArea": "multi_area",
+}
+"""The kind of each class of ``grid2op.Opponent`` that :mod:`rl2grid.mdp.opponents` plays."""
 
 _VECTORS = (
     "sub_info",
@@ -102,24 +128,58 @@ def make_environment(bundled_name: str) -> Any:
         return grid2op.make(str(folder), backend=LightSimBackend())
 
 
+class Identity(NamedTuple):
+    """What a grid is called; fields as in :class:`rl2grid.grids.Grid`."""
+
+    id: str
+    grid2op_name: str
+    bundled_names: tuple[str, ...]
+    level_sizes: tuple[int, ...]
+
+
 def describe_environment(grid_id: str) -> dict[str, Any]:
-    """Everything that :class:`rl2grid.grids.Grid` holds, read from the live environment."""
+    """Everything that :class:`rl2grid.grids.Grid` holds of one of the seven grids, read from live environments."""
     source = SOURCES[grid_id]
     environments = [make_environment(name) for name in source.bundled_names if not name.startswith("rte_")]
-    environment = environments[0]
+    identity = Identity(grid_id, source.grid2op_name, source.bundled_names, source.level_sizes)
+    maintenance = _BUS14_MAINTENANCE if grid_id == "bus14" else read_maintenance(environments[0])
+    load_p_max = np.max([_load_p_max(each) for each in environments], axis=0)
+    record = read_grid_record(environments[0], identity, maintenance, load_p_max)
+    for environment in environments:
+        environment.close()
+    return record
+
+
+def describe_network(bundled_name: str) -> dict[str, Any]:
+    """Everything that the file of a network holds, read from a live environment of the wheel."""
+    environment = make_environment(bundled_name)
+    record = read_initial_network(environment)
+    environment.close()
+    return record
+
+
+def read_grid_record(
+    environment: Any, identity: Identity, maintenance: dict[str, Any], load_p_max: NDArray[np.float32]
+) -> dict[str, Any]:
+    """The record of :class:`rl2grid.grids.Grid`, as plain JSON values.
+
+    Args:
+        environment: a ``grid2op.Environment`` with LightSim2Grid; only read.
+        identity: what the grid is called.
+        maintenance: how maintenance is sampled; see :func:`read_maintenance`.
+        load_p_max: [load] largest demand of each load, MW.
+    """
+    layout = environment.grid_layout or {}
     record: dict[str, Any] = {
-        "id": grid_id,
-        "grid2op_name": source.grid2op_name,
-        "bundled_names": source.bundled_names,
-        "level_sizes": source.level_sizes,
+        **identity._asdict(),
         "rules": _rules(environment),
         "opponent": _opponent(environment),
-        "maintenance": _maintenance(grid_id, environment),
-        "layout": [[float(x) for x in environment.grid_layout[name]] for name in environment.name_sub],
+        "maintenance": maintenance,
+        "layout": [[float(x) for x in layout.get(name, (0.0, 0.0))] for name in environment.name_sub],
         "sub_area": _areas(environment),
         "thermal_limit": environment.get_thermal_limit(),
         "slack_gen": _slack_generator(environment),
-        "load_p_max": np.max([_load_p_max(each) for each in environments], axis=0),
+        "load_p_max": load_p_max,
     }
     for name in (*_NAMES, *_VECTORS):
         record[name] = getattr(environment, name)
@@ -130,6 +190,46 @@ def describe_environment(grid_id: str) -> dict[str, Any]:
         record |= {"name_storage": [], "storage_to_subid": [], "storage_pos_topo_vect": []}
     plain: dict[str, Any] = json.loads(json.dumps(record, default=_plain))
     return plain
+
+
+def read_initial_network(environment: Any) -> dict[str, Any]:
+    """The record of the network, :func:`rl2grid.powerflow.model.read_network_record`, before any time series.
+
+    Puts the grid of ``environment`` back to its initial state: reset the environment before it plays again.
+    """
+    backend = environment.backend
+    backend.reset("")
+    return read_network_record(backend._grid, backend.tol, backend.max_it)
+
+
+def read_maintenance(environment: Any) -> dict[str, Any]:
+    """The record of :class:`rl2grid.grids.MaintenanceConfig`; no line where the series record maintenance.
+
+    Begins an episode, because the series say how maintenance is sampled only then.
+    """
+    environment.reset()
+    data = read_series(environment)
+    lines = getattr(data, "line_to_maintenance", None)
+    if not lines:
+        return _NO_MAINTENANCE
+    return {
+        "lines": sorted(environment.name_line.tolist().index(name) for name in lines),
+        "monthly_daily_probability": data.daily_proba_per_month_maintenance,
+        "monthly_max_per_day": data.max_daily_number_per_month_maintenance,
+        "start_hour": data.maintenance_starting_hour,
+        "end_hour": data.maintenance_ending_hour,
+    }
+
+
+def environment_name(environment: Any) -> str:
+    """Name of the folder of a ``grid2op.Environment``; Grid2Op's own name for it contains the backend's."""
+    return Path(environment.get_path_env()).name or str(environment.name)
+
+
+def read_series(environment: Any) -> Any:
+    """The ``grid2op.Chronics.GridValue`` that feeds the present episode."""
+    source = environment.chronics_handler.real_data
+    return getattr(source, "data", source)
 
 
 def _rules(environment: Any) -> dict[str, Any]:
@@ -148,11 +248,7 @@ def _rules(environment: Any) -> dict[str, Any]:
 def _opponent(environment: Any) -> dict[str, Any]:
     space = environment._oppSpace
     opponent = space.opponent
-    kind = {
-        "WeightedRandomOpponent": "weighted",
-        "GeometricOpponent": "geometric",
-        "GeometricOpponentMultiArea": "multi_area",
-    }.get(type(opponent).__name__, "none")
+    kind = OPPONENT_KINDS[type(opponent).__name__]
     if kind == "none":
         return {"kind": "none"}
     areas = opponent.list_opponents if kind == "multi_area" else [opponent]
@@ -177,42 +273,13 @@ def _opponent(environment: Any) -> dict[str, Any]:
     }
 
 
-def _maintenance(grid_id: str, environment: Any) -> dict[str, Any]:
-    if grid_id == "bus14":
-        return {
-            "lines": _BUS14_MAINTENANCE_LINES,
-            "monthly_daily_probability": [0.02] * 12,
-            "monthly_max_per_day": [1] * 12,
-            "start_hour": 9,
-            "end_hour": 17,
-        }
-    environment.reset()
-    data = environment.chronics_handler.real_data.data
-    lines = getattr(data, "line_to_maintenance", None)
-    if not lines:
-        return {
-            "lines": [],
-            "monthly_daily_probability": [0.0] * 12,
-            "monthly_max_per_day": [0] * 12,
-            "start_hour": 9,
-            "end_hour": 17,
-        }
-    return {
-        "lines": sorted(environment.name_line.tolist().index(name) for name in lines),
-        "monthly_daily_probability": data.daily_proba_per_month_maintenance,
-        "monthly_max_per_day": data.max_daily_number_per_month_maintenance,
-        "start_hour": data.maintenance_starting_hour,
-        "end_hour": data.maintenance_ending_hour,
-    }
-
-
 def _areas(environment: Any) -> list[int]:
     rules = environment._game_rules.legal_action
     by_area = getattr(rules, "substations_id_by_area", None)
     areas = [0] * environment.n_sub
-    for area, substations in (by_area or {}).items():
+    for area, substations in enumerate((by_area or {}).values()):
         for substation in substations:
-            areas[substation] = int(area)
+            areas[substation] = area
     return areas
 
 
@@ -226,7 +293,7 @@ def _load_p_max(environment: Any) -> Any:
     for index in range(len(environment.chronics_handler.subpaths)):
         environment.set_id(index)
         environment.reset()
-        largest = np.maximum(largest, environment.chronics_handler.real_data.data.load_p.max(axis=0))
+        largest = np.maximum(largest, read_series(environment).load_p.max(axis=0))
     return largest
 
 
@@ -251,11 +318,16 @@ def main() -> None:
     )
     output: Path = parser.parse_args().output
     output.mkdir(parents=True, exist_ok=True)
-    for grid_id in SOURCES:
+    for grid_id, source in SOURCES.items():
         record = describe_environment(grid_id)
-        lines = ",\n".join(f" {json.dumps(key)}: {json.dumps(value)}" for key, value in record.items())
-        (output / f"{grid_id}.json").write_text("{\n" + lines + "\n}\n")
+        _write_record(output / f"{grid_id}.json", record)
+        _write_record(output / f"{grid_id}.network.json", describe_network(source.bundled_names[0]))
         print(f"{grid_id}: {len(record['name_line'])} lines, opponent {record['opponent']['kind']}")
+
+
+def _write_record(path: Path, record: dict[str, Any]) -> None:
+    lines = ",\n".join(f" {json.dumps(key)}: {json.dumps(value)}" for key, value in record.items())
+    path.write_text("{\n" + lines + "\n}\n")
 
 
 if __name__ == "__main__":

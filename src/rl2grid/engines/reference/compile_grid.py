@@ -1,0 +1,152 @@
+"""Any Grid2Op environment as data, so that it can be simulated without Grid2Op.
+
+:func:`compile_grid` reads a live environment once and keeps what it read in the data folder;
+:func:`load_compiled` reads that without importing Grid2Op. Only environments are taken whose every feature is
+simulated (:mod:`rl2grid.engines.reference.supported`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import filelock
+import numpy as np
+
+from rl2grid.engines.reference.extract import (
+    Identity,
+    environment_name,
+    read_grid_record,
+    read_initial_network,
+    read_maintenance,
+    read_series,
+)
+from rl2grid.errors import UsageError
+from rl2grid.grids import Grid
+from rl2grid.grids.grid import grid_from_record
+from rl2grid.powerflow.model import Network, network_from_record
+from rl2grid.scenarios.cache import data_folder
+
+FORMAT_VERSION = 1
+"""Raised whenever the files of compiled grids would be read differently."""
+
+_HASH_DIGITS = 16
+
+
+class CompiledGrid(NamedTuple):
+    """All that a simulation needs to know about a grid that never changes."""
+
+    grid: Grid
+    """Named after the folder of its environment. There is one level, of all topology actions; ``load_p_max`` is
+    that of the first time series; ``bundled_names`` is empty."""
+    network: Network
+    hash: str
+    """16 hexadecimal digits that name everything read; also ``grid.hash``."""
+
+
+def compile_grid(environment: Any) -> CompiledGrid:
+    """Read a Grid2Op environment into a grid and its network, and keep them in the data folder.
+
+    The environment is left as it is: a copy plays the first row of its first time series.
+
+    Args:
+        environment: a ``grid2op.Environment`` with ``LightSimBackend``. Only its present time series is searched
+            for hazards, which are not simulated.
+
+    Raises:
+        UsageError: the environment has a feature that is not simulated, or the data folder cannot be written.
+    """
+    # Here and not above: load_compiled does without Grid2Op.
+    from rl2grid.engines.reference.supported import require_supported, require_supported_model
+
+    require_supported(environment)
+    episode = environment.copy()
+    try:
+        episode.set_id(0)
+        maintenance = read_maintenance(episode)
+        load_p_max = _load_p_max(episode)
+        network = read_initial_network(episode)
+        require_supported_model(environment, episode.backend._grid)
+    finally:
+        episode.close()
+    name = environment_name(environment)
+    identity = Identity(name, name, (), (_number_of_topology_actions(environment),))
+    record = {"grid": read_grid_record(environment, identity, maintenance, load_p_max), "network": network}
+    _keep(record)
+    return _from_record(record)
+
+
+def load_compiled(source: str | Path) -> CompiledGrid:
+    """A grid that :func:`compile_grid` has kept, without Grid2Op.
+
+    Args:
+        source: the hash of the grid, or the path of its file (``*.json``).
+
+    Raises:
+        UsageError: there is no such file, or it is damaged.
+    """
+    path = Path(source) if str(source).endswith(".json") else compiled_path(str(source))
+    record = _read(path)
+    if record is None:
+        raise UsageError(f"Compiled grid {source} is missing or damaged ({path}): compile its environment again.")
+    return _from_record(record)
+
+
+def compiled_path(grid_hash: str) -> Path:
+    """Where the grid with this hash is kept."""
+    return data_folder() / "grids" / f"v{FORMAT_VERSION}" / f"{grid_hash}.json"
+
+
+def _load_p_max(environment: Any) -> Any:
+    """[load] largest demand in the present time series, MW; the present demand where it is not read from a file."""
+    load_p = getattr(read_series(environment), "load_p", None)
+    if load_p is None or not len(load_p):
+        return environment.get_obs().load_p
+    return np.max(load_p, axis=0)
+
+
+def _number_of_topology_actions(environment: Any) -> int:
+    """The size of :func:`rl2grid.mdp.actions.full_catalogue`, which may be too large to be built."""
+    moves: list[int] = [(1 << (n_elements - 1)) - 1 for n_elements in environment.sub_info.tolist()]
+    return 1 + sum(moves) + int(environment.n_line)
+
+
+def _hash(record: dict[str, Any]) -> str:
+    content = json.dumps({"format": FORMAT_VERSION, **record}, sort_keys=True)
+    return hashlib.sha256(content.encode()).hexdigest()[:_HASH_DIGITS]
+
+
+def _keep(record: dict[str, Any]) -> None:
+    path = compiled_path(_hash(record))
+    if _read(path) is not None:
+        return
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with filelock.FileLock(path.with_suffix(".lock")):
+            temporary = path.with_name(f".{path.name}.{os.getpid()}")
+            temporary.write_text(json.dumps({"hash": _hash(record), **record}))
+            os.replace(temporary, path)
+    except OSError as error:
+        raise UsageError(
+            f"The data folder {data_folder()} cannot be written ({error}): set RL2GRID_DATA to one that can."
+        ) from error
+
+
+def _read(path: Path) -> dict[str, Any] | None:
+    """The record, or None where the file is missing or is not what its hash says."""
+    try:
+        record: dict[str, Any] = json.loads(path.read_text())
+        expected = record.pop("hash")
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return None
+    return record if _hash(record) == expected else None
+
+
+def _from_record(record: dict[str, Any]) -> CompiledGrid:
+    grid_hash = _hash(record)
+    grid = grid_from_record(record["grid"])
+    vars(grid)["hash"] = grid_hash  # fills the cached property, which would look for the file of a benchmark grid
+    return CompiledGrid(grid, network_from_record(grid, record["network"]), grid_hash)
