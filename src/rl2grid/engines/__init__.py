@@ -1,7 +1,7 @@
 """The simulators that play the decision process."""
 
-ENGINES: tuple[str, ...] = ("reference",)
-"""Engines by name; ``reference`` is Grid2Op with LightSim2Grid."""
+ENGINES: tuple[str, ...] = ("native", "reference")
+"""Engines by name: ``native`` is ours, compiled; ``reference`` is Grid2Op with LightSim2Grid."""
 
 HEURISTICS: tuple[str, ...] = ("idle", "recovery")
 """What may play while the grid is safe; without one, the agent decides every step."""

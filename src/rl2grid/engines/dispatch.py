@@ -94,7 +94,7 @@ def dispatch_is_needed(actual: Floats, target: Floats, storage: float, curtailme
     for gen in range(actual.size):
         if abs(actual[gen] - target[gen]) >= TOLERANCE:
             return True
-    return bool(abs(_sum(actual, actual.size)) >= TOLERANCE)
+    return bool(abs(rounded_sum(actual, actual.size)) >= TOLERANCE)
 
 
 @jit
@@ -232,12 +232,12 @@ def _can_balance(
         rise[k] = new_p[gen] - (setpoint[gen] - actual[gen])
         down[k] = max(pmin[gen] - setpoint[gen], -ramp_down[gen])
         up[k] = min(pmax[gen] - setpoint[gen], ramp_up[gen])
-    move = _sum(rise, members.size) + np.float32(power)
-    return bool(_sum(down, members.size) <= move <= _sum(up, members.size))
+    move = rounded_sum(rise, members.size) + np.float32(power)
+    return bool(rounded_sum(down, members.size) <= move <= rounded_sum(up, members.size))
 
 
 @jit
-def _sum(values: Floats, size: int) -> np.float32:
+def rounded_sum(values: Floats, size: int) -> np.float32:
     """``values[:size].sum()`` with the rounding of NumPy, which adds in eight parallel sums.
 
     NumPy does so up to 128 values, more than any grid here has generators.

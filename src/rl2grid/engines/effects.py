@@ -2,26 +2,53 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 
 from rl2grid.grids import Grid
 from rl2grid.mdp.actions import ActionKind, StepAction, decode_continuous
-from rl2grid.mdp.state import GridState
+from rl2grid.mdp.state import F32, Flags, GridState
 
 _TOLERANCE = 0.05
 """MW below which a difference between what was asked and what happened is not worth a word."""
 
 
-def refusal(state: GridState, i: int, action: StepAction) -> str:
-    """Why the rules refuse a topology action in the state before it; empty where they do not."""
-    if action.kind == ActionKind.MOVE and (left := int(state.time_before_cooldown_sub[i, action.target])):
-        return f"refused: substation {action.target} cools down for {left} more steps"
-    if action.kind == ActionKind.SWITCH and (left := int(state.time_before_cooldown_line[i, action.target])):
-        return f"refused: line {action.target} cools down for {left} more steps"
-    return ""
+class AfterAction(Protocol):
+    """What is read right after the agent's step: a :class:`~rl2grid.mdp.state.GridState` has it."""
+
+    @property
+    def terminated(self) -> Flags: ...
+    @property
+    def illegal(self) -> Flags: ...
+    @property
+    def ambiguous(self) -> Flags: ...
+    @property
+    def target_dispatch(self) -> F32: ...
+    @property
+    def actual_dispatch(self) -> F32: ...
+    @property
+    def storage_power(self) -> F32: ...
 
 
-def clipping(grid: Grid, state: GridState, i: int, action: StepAction) -> str:
+def cooldown_left(state: GridState, i: int, action: StepAction) -> int:
+    """Steps that the line or substation of a topology action cools down in the state before it."""
+    if action.kind == ActionKind.MOVE:
+        return int(state.time_before_cooldown_sub[i, action.target])
+    if action.kind == ActionKind.SWITCH:
+        return int(state.time_before_cooldown_line[i, action.target])
+    return 0
+
+
+def refusal(action: StepAction, left: int) -> str:
+    """Why the rules refuse a topology action whose target cools down; empty where ``left`` is 0."""
+    if left == 0:
+        return ""
+    target = "substation" if action.kind == ActionKind.MOVE else "line"
+    return f"refused: {target} {action.target} cools down for {left} more steps"
+
+
+def clipping(grid: Grid, state: AfterAction, i: int, action: StepAction) -> str:
     """What of a continuous action was not carried out, read from the state right after its step."""
     if action.kind != ActionKind.INJECTION or action.values is None or state.terminated[i]:
         return ""

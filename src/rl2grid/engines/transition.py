@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from rl2grid.engines.base import Engine
-from rl2grid.engines.effects import clipping, refusal
+from rl2grid.engines.effects import clipping, cooldown_left, refusal
 from rl2grid.mdp.accumulate import accrue, begin_episode, begin_transition
 from rl2grid.mdp.actions import DO_NOTHING, StepAction
 from rl2grid.mdp.heuristics import is_safe, reconnect_action, recovery_action
@@ -56,7 +56,7 @@ class Transitions:
         if state.decisions[i] > 0:
             begin_transition(state, i)
         state.decisions[i] += 1
-        refused = refusal(state, i, action)
+        refused = refusal(action, cooldown_left(state, i, action))
         self._step(i, action)
         self.effects[i] = refused or clipping(self.engine.grid, state, i, action)
         illegal, ambiguous = state.illegal[i], state.ambiguous[i]

@@ -77,10 +77,9 @@ class ReferenceEngine:
         """Play one Grid2Op step of environment ``i``."""
         state, environment = self.state, self._environments[i]
         impossible = self._is_impossible(i, action)
-        played = self._do_nothing[i] if impossible else self._grid2op_action(i, action)
-        observation, _, done, info = environment.step(played)
+        observation, _, done, info = environment.step(self._played(i, action, impossible))
         state.step[i] += 1
-        state.illegal[i] = info["is_illegal"] or info["failed_redispatching"] or impossible
+        state.illegal[i] = info["is_illegal"] or impossible
         state.ambiguous[i] = info["is_ambiguous"]
         self._observations[i] = observation
         if self._opponent is not None:
@@ -97,7 +96,7 @@ class ReferenceEngine:
         if self.state.terminated[i] or observation is None:
             raise UsageError("Nothing can be simulated after a game over: reset the environment first.")
         impossible = self._is_impossible(i, action)
-        played = self._do_nothing[i] if impossible else self._grid2op_action(i, action)
+        played = self._played(i, action, impossible)
         try:
             simulated, _, _, info = observation.simulate(played, time_step=horizon)
         except NoForecastAvailable:
@@ -105,7 +104,7 @@ class ReferenceEngine:
                 f"Scenario {observation._obs_env.chronics_handler.get_id()!r} has no forecast {horizon} steps ahead."
             ) from None
         _copy_episode(self.state, i, result, horizon)
-        result.illegal[0] = info["is_illegal"] or info["failed_redispatching"] or impossible
+        result.illegal[0] = info["is_illegal"] or impossible
         result.ambiguous[0] = info["is_ambiguous"]
         if simulated.topo_vect.max() < 0:
             self._read_game_over(result, 0, observation._obs_env, info["exception"])
@@ -161,11 +160,8 @@ class ReferenceEngine:
         state.curtailment_limit[i] = 1
 
     def _is_impossible(self, i: int, action: StepAction) -> bool:
-        """Whether the whole action is refused because its redispatch can never be carried out.
-
-        Only under ``dispatch="exact"``: Grid2Op itself would keep parts of the action.
-        """
-        if self._dispatch != "exact" or action.kind != ActionKind.INJECTION or action.values is None:
+        """Whether the redispatch of an action can never be carried out, which makes it illegal."""
+        if action.kind != ActionKind.INJECTION or action.values is None:
             return False
         environment = self._environments[i]
         return redispatch_is_impossible(
@@ -176,6 +172,12 @@ class ReferenceEngine:
             self.grid.gen_pmin,
             self.grid.gen_pmax,
         )
+
+    def _played(self, i: int, action: StepAction, impossible: bool) -> Any:
+        """The Grid2Op action: under ``dispatch="exact"`` nothing is kept of an impossible one, Grid2Op keeps parts."""
+        if impossible and self._dispatch == "exact":
+            return self._do_nothing[i]
+        return self._grid2op_action(i, action)
 
     def _grid2op_action(self, i: int, action: StepAction) -> Any:
         """A fresh Grid2Op action: Grid2Op caches its verdict of ambiguity on the object."""

@@ -1,0 +1,218 @@
+"""Storage, curtailment and redispatch within a step (Grid2Op's ``StorageModule``, ``CurtailmentModule``).
+
+Single precision, operation by operation as in Grid2Op, so that both agree on what is feasible.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rl2grid.compile import jit
+from rl2grid.engines.dispatch import (
+    NEGLIGIBLE,
+    add_request,
+    dispatch_is_needed,
+    find_dispatch,
+    redispatch_is_impossible,
+    rounded_sum,
+)
+from rl2grid.engines.native.memory import Memory
+from rl2grid.engines.native.plant import INITIAL_CHARGE, Plant
+from rl2grid.mdp.state import F32, GridState
+
+_FULL = np.float32(1.0)
+_NONE = np.float32(0.0)
+
+
+@jit
+def begin_generation(plant: Plant, state: GridState, memory: Memory, i: int) -> None:
+    """Dispatch, limits and charge of row ``i`` as a reset finds them."""
+    state.target_dispatch[i] = 0.0
+    state.actual_dispatch[i] = 0.0
+    state.curtailment_limit[i] = 1.0
+    state.gen_p_before_curtail[i] = 0.0
+    state.storage_power[i] = 0.0
+    state.storage_power_target[i] = 0.0
+    for unit in range(plant.storage_emax.shape[0]):
+        lost = plant.storage_loss[unit] * plant.hours_per_step[0]
+        state.storage_charge[i, unit] = INITIAL_CHARGE * plant.storage_emax[unit] + lost
+
+
+@jit
+def decode_injection(plant: Plant, state: GridState, memory: Memory, i: int, values: F32) -> None:
+    """Write what a continuous action asks for: redispatch, curtailment limits, storage.
+
+    :func:`rl2grid.mdp.actions.decode_continuous`, compiled; limits go into effect at once.
+    """
+    entry = 0
+    for gen in plant.redispatch_gen:
+        ramp = state.gen_max_ramp_up[gen] if values[entry] > 0 else state.gen_max_ramp_down[gen]
+        memory.request[i, gen] = values[entry] * ramp
+        entry += 1
+    for gen in plant.curtail_gen:
+        state.curtailment_limit[i, gen] = _FULL + min(values[entry], _NONE)
+        entry += 1
+    for unit in range(plant.storage_emax.shape[0]):
+        most = plant.storage_max_p_absorb[unit] if values[entry] > 0 else plant.storage_max_p_prod[unit]
+        memory.storage_request[i, unit] = values[entry] * most
+        entry += 1
+
+
+@jit
+def request_is_impossible(plant: Plant, state: GridState, memory: Memory, i: int, values: F32) -> bool:
+    """Whether the redispatch of a continuous action can never be carried out; writes ``request``."""
+    memory.request[i] = 0.0
+    for entry in range(plant.redispatch_gen.shape[0]):
+        gen = plant.redispatch_gen[entry]
+        ramp = state.gen_max_ramp_up[gen] if values[entry] > 0 else state.gen_max_ramp_down[gen]
+        memory.request[i, gen] = values[entry] * ramp
+    return redispatch_is_impossible(
+        memory.request[i],
+        state.target_dispatch[i],
+        state.actual_dispatch[i],
+        memory.modified[i],
+        state.gen_pmin,
+        state.gen_pmax,
+    )
+
+
+@jit
+def use_storage(plant: Plant, state: GridState, memory: Memory, i: int) -> None:
+    """Charge and discharge as asked for in ``storage_request``, within what the units hold."""
+    hours = plant.hours_per_step[0]
+    memory.charge_before[i] = state.storage_charge[i]
+    in_use = False
+    for unit in range(plant.storage_emax.shape[0]):
+        power = memory.storage_request[i, unit]
+        state.storage_power_target[i, unit] = 0.0
+        state.storage_power[i, unit] = 0.0
+        if abs(power) < NEGLIGIBLE:
+            continue
+        in_use = True
+        # Grid2Op multiplies by a double-precision efficiency here.
+        efficiency = np.float64(plant.storage_charging_efficiency[unit])
+        if power < 0:
+            efficiency = 1.0 / np.float64(plant.storage_discharging_efficiency[unit])
+        energy = np.float64(power * hours) * efficiency
+        state.storage_charge[i, unit] = np.float32(np.float64(state.storage_charge[i, unit]) + energy)
+        state.storage_power_target[i, unit] = power
+        state.storage_power[i, unit] = power
+    if in_use:
+        for unit in range(plant.storage_emax.shape[0]):
+            _keep_within_capacity(plant, state, i, unit)
+    absorbed = rounded_sum(state.storage_power[i], plant.storage_emax.shape[0]) if in_use else _NONE
+    memory.storage_change[i] = absorbed - memory.stored[i]
+    memory.stored[i] = absorbed
+    lose_charge(plant, state, i)
+
+
+@jit
+def _keep_within_capacity(plant: Plant, state: GridState, i: int, unit: int) -> None:
+    per_hour = _FULL / plant.hours_per_step[0]
+    too_much = state.storage_charge[i, unit] - plant.storage_emax[unit]
+    if too_much > 0:
+        state.storage_power[i, unit] -= per_hour * too_much / plant.storage_charging_efficiency[unit]
+        state.storage_charge[i, unit] = plant.storage_emax[unit]
+    too_little = state.storage_charge[i, unit] - plant.storage_emin[unit]
+    if too_little < 0:
+        state.storage_power[i, unit] -= per_hour * too_little * plant.storage_discharging_efficiency[unit]
+        state.storage_charge[i, unit] = plant.storage_emin[unit]
+
+
+@jit
+def lose_charge(plant: Plant, state: GridState, i: int) -> None:
+    """Withdraw what storage units lose in a step."""
+    for unit in range(plant.storage_emax.shape[0]):
+        left = state.storage_charge[i, unit] - plant.storage_loss[unit] * plant.hours_per_step[0]
+        state.storage_charge[i, unit] = max(left, _NONE)
+
+
+@jit
+def curtail(plant: Plant, state: GridState, memory: Memory, i: int) -> None:
+    """Hold renewables to their limits: lowers ``new_p``, notes the change of the curtailed power."""
+    new_p, before = memory.new_p[i], state.gen_p_before_curtail[i]
+    limited = np.empty((2, new_p.shape[0]), np.float32)
+    count = 0
+    for gen in range(new_p.shape[0]):
+        if not state.gen_renewable[gen]:
+            continue
+        before[gen] = new_p[gen]
+        limit = state.curtailment_limit[i, gen]
+        if abs(limit - _FULL) < NEGLIGIBLE:
+            continue
+        new_p[gen] = min(state.gen_pmax[gen] * limit, new_p[gen])
+        limited[0, count] = new_p[gen]
+        limited[1, count] = before[gen]
+        count += 1
+    curtailed = rounded_sum(limited[0], count) - rounded_sum(limited[1], count)
+    memory.curtailment_change[i] = curtailed - memory.curtailed[i]
+    memory.curtailed[i] = curtailed
+
+
+@jit
+def request_redispatch(state: GridState, memory: Memory, i: int) -> None:
+    """Add the redispatch asked for in ``request`` to the targets."""
+    add_request(memory.request[i], state.target_dispatch[i], state.actual_dispatch[i], memory.modified[i])
+
+
+@jit
+def target_is_out_of_reach(state: GridState, i: int) -> bool:
+    """Whether a target lies further from zero than a generator's range from pmin to pmax."""
+    for gen in range(state.gen_pmax.shape[0]):
+        target, widest = state.target_dispatch[i, gen], state.gen_pmax[gen] - state.gen_pmin[gen]
+        if target > widest or target < -widest:
+            return True
+    return False
+
+
+@jit
+def take_back_request(plant: Plant, state: GridState, memory: Memory, i: int) -> None:
+    """What Grid2Op does about an impossible redispatch: the targets are restored, and storage goes wrong.
+
+    Its charge is restored while its power still flows, and the balance counts it anew.
+    """
+    for gen in range(state.gen_pmax.shape[0]):
+        state.target_dispatch[i, gen] -= memory.request[i, gen]
+    if plant.storage_emax.shape[0] == 0:
+        return
+    state.storage_charge[i] = memory.charge_before[i]
+    memory.storage_change[i] -= memory.stored[i]
+    lose_charge(plant, state, i)
+
+
+@jit
+def needs_dispatch(state: GridState, memory: Memory, i: int) -> bool:
+    """Whether the generators have to be dispatched in this step."""
+    return dispatch_is_needed(
+        state.actual_dispatch[i], state.target_dispatch[i], memory.storage_change[i], memory.curtailment_change[i]
+    )
+
+
+@jit
+def dispatch(state: GridState, memory: Memory, i: int) -> bool:
+    """Find the exact dispatch; False, a game over, if there is none."""
+    power = np.float64(memory.storage_change[i]) - np.float64(memory.curtailment_change[i])
+    return find_dispatch(
+        memory.new_p[i],
+        memory.setpoint[i],
+        state.target_dispatch[i],
+        state.actual_dispatch[i],
+        memory.modified[i],
+        state.gen_pmin,
+        state.gen_pmax,
+        state.gen_max_ramp_up,
+        state.gen_max_ramp_down,
+        state.gen_redispatchable,
+        power,
+        state.actual_dispatch[i],
+    )
+
+
+@jit
+def set_generators(state: GridState, memory: Memory, i: int) -> None:
+    """The production that the generators are set to: the series' plus the dispatch."""
+    for gen in range(memory.new_p.shape[1]):
+        dispatched = state.actual_dispatch[i, gen]
+        memory.gen_p[i, gen] = memory.new_p[i, gen]
+        if abs(dispatched) >= NEGLIGIBLE:
+            memory.gen_p[i, gen] += dispatched
