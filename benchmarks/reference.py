@@ -52,7 +52,7 @@ def milliseconds(reset: Callable[[], Any], times: int) -> float:
 
 def measure(grid_id: str, rounds: int, steps: int) -> dict[str, Any]:
     """Both engines in turn, ``rounds`` times."""
-    ours = gymnasium.make(f"rl2grid/{grid_id}-T0-v0", split="bundled", disable_env_checker=True)
+    ours = gymnasium.make(f"rl2grid/{grid_id}-T0-v0", engine="reference", split="bundled", disable_env_checker=True)
     plain = make_environment(load_grid(grid_id).bundled_names[0])
     ours.reset(seed=0)
     plain.reset()
@@ -90,7 +90,7 @@ def worker_memory(grid_id: str) -> dict[str, float]:
     code = (
         "import sys, gymnasium, rl2grid\n"
         "n = int(sys.argv[2])\n"
-        "env = gymnasium.make_vec(f'rl2grid/{sys.argv[1]}-T0-v0', num_envs=n, num_workers=0)\n"
+        "env = gymnasium.make_vec(f'rl2grid/{sys.argv[1]}-T0-v0', num_envs=n, engine='reference', num_workers=0)\n"
         "env.reset(seed=0)\n"
         "env.step([0] * n)\n"
         "rows = open('/proc/self/smaps_rollup').read().splitlines()\n"

@@ -2,9 +2,11 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
+from rl2grid.analysis.results import load_evaluation
 from rl2grid.cli.main import main
 
 
@@ -47,11 +49,15 @@ def test_tasks_of_one_grid(capsys):
         (["train", "ppo", "bus14-T0", "--preset", "best"], "choose one of default, paper"),
         (["train", "ppo", "bus14-T0", "--heuristic", "lazy"], "choose one of None, idle, recovery"),
         (["train", "ppo", "bus14-T0", "--num-envs", "0"], "num_envs of at least 1"),
+        (["train", "ppo", "bus14-T0", "--engine", "fast"], "choose one of native, reference"),
+        (["train", "ppo", "bus14-T0", "--num-workers", "2"], "is not for engine='native': give num_threads"),
+        (["train", "ppo", "bus14-T0", "--num-threads", "0"], "num_threads=0 is not allowed"),
         (["train", "--resume", "no-such-run"], "holds no run"),
         (["evaluate", "genius", "bus14-T0"], "choose one of do-nothing, random, recovery"),
         (["evaluate", "do-nothing", "bus99-T0"], "with a grid of bus14"),
         (["evaluate", "do-nothing", "bus14-T0", "--split", "dev"], "choose from 'train', 'validation'"),
         (["evaluate", "do-nothing", "bus14-T0", "--seeds", "0"], "seeds"),
+        (["evaluate", "do-nothing", "bus14-T0", "--engine", "fast"], "choose from 'native', 'reference'"),
         (["rank", "bus15", "--provisional"], "choose one of bus14"),
         (["rank", "bus14", "--provisional", "--states", "0"], "at least 1"),
     ],
@@ -74,3 +80,20 @@ def test_help_of_training_lists_hyperparameters_with_their_meaning(capsys):
 def test_works_as_a_module_and_says_its_version():
     command = [sys.executable, "-m", "rl2grid.cli", "--version"]
     assert subprocess.run(command, capture_output=True, text=True, check=True).stdout.startswith("rl2grid 0.")
+
+
+def test_an_evaluation_names_its_engine_and_may_use_the_other(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for flags, folder in (([], "validation"), (["--engine", "reference", "--workers", "0"], "validation-reference")):
+        assert main(["evaluate", "do-nothing", "bus14-T0", *flags]) == 0
+        assert f"{folder}/episodes.csv" in capsys.readouterr().out.replace("\n", "")
+    native, reference = (
+        load_evaluation(Path("runs/bus14-T0-v0-do-nothing/evaluation") / folder)
+        for folder in ("validation", "validation-reference")
+    )
+    assert [result.identity["engine"] for result in (native, reference)] == ["native", "reference"]
+    assert "--engine" not in native.command
+    assert reference.command.endswith("--engine reference")
+    for mine, theirs in zip(native.episodes, reference.episodes, strict=True):
+        assert (mine.grid_steps, mine.game_over) == (theirs.grid_steps, theirs.game_over)
+        assert mine.episode_return == pytest.approx(theirs.episode_return, rel=1e-6)

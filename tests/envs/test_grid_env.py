@@ -8,48 +8,60 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import rl2grid  # noqa: F401 - registers the tasks
+from rl2grid.engines import ENGINES
 from rl2grid.envs.info import INFO_KEYS
 from rl2grid.envs.tasks import all_tasks
 from rl2grid.errors import UsageError
 from rl2grid.grids import GRID_IDS
 from rl2grid.scenarios.library import list_scenarios
 
+BOTH_ENGINES = pytest.mark.parametrize("engine", ENGINES)
+
 
 def make(task_id, **keywords):
     return gymnasium.make(f"rl2grid/{task_id}-v0", **keywords)
 
 
-def checked(task_id):
+def checked(task_id, engine):
     with warnings.catch_warnings():
         # Gymnasium advises bounds for the observation space; loadings have none.
         warnings.simplefilter("ignore")
-        environment = gymnasium.make(task_id, disable_env_checker=True)
+        environment = gymnasium.make(task_id, engine=engine, disable_env_checker=True)
         check_env(environment.unwrapped, skip_render_check=True)
         environment.close()
 
 
-@pytest.mark.parametrize("grid_id", GRID_IDS)
+@pytest.mark.parametrize(
+    ("engine", "grid_id"),
+    [*(("native", grid_id) for grid_id in GRID_IDS), ("reference", "bus14"), ("reference", "bus118-MOB-v1")],
+)
 @pytest.mark.parametrize("kind", ["T0", "R"])
-def test_passes_the_environment_checker(grid_id, kind):
-    checked(f"rl2grid/{grid_id}-{kind}-v0")
+def test_passes_the_environment_checker(engine, grid_id, kind):
+    checked(f"rl2grid/{grid_id}-{kind}-v0", engine)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("task_id", sorted(all_tasks()))
-def test_all_tasks_pass_the_environment_checker(task_id):
-    checked(task_id)
+@BOTH_ENGINES
+def test_all_tasks_pass_the_environment_checker(task_id, engine):
+    checked(task_id, engine)
+
+
+@pytest.fixture(scope="module", params=ENGINES)
+def engine(request):
+    return request.param
 
 
 @pytest.fixture(scope="module")
-def plain():
-    environment = make("bus14-T1", split="bundled", opponent=False, maintenance=False, gamma=0.9)
+def plain(engine):
+    environment = make("bus14-T1", engine=engine, split="bundled", opponent=False, maintenance=False, gamma=0.9)
     yield environment.unwrapped
     environment.close()
 
 
 @pytest.fixture(scope="module")
-def idle():
-    environment = make("bus14-T1", split="bundled", heuristic="idle", maintenance=False, gamma=0.9)
+def idle(engine):
+    environment = make("bus14-T1", engine=engine, split="bundled", heuristic="idle", maintenance=False, gamma=0.9)
     yield environment.unwrapped
     environment.close()
 
@@ -75,11 +87,11 @@ def test_seed_decides_the_episode(plain):
     np.testing.assert_array_equal(following, plain.reset()[0])
 
 
-def test_training_begins_at_random_rows_and_evaluation_at_row_zero():
-    with make("bus14-T0") as environment:
+def test_training_begins_at_random_rows_and_evaluation_at_row_zero(engine):
+    with make("bus14-T0", engine=engine) as environment:
         starts = {environment.reset(seed=seed)[1]["start"] for seed in range(5)}
     assert len(starts) > 1
-    with make("bus14-T0", split="test") as environment:
+    with make("bus14-T0", engine=engine, split="test") as environment:
         assert {environment.reset(seed=seed)[1]["start"] for seed in range(5)} == {0}
 
 
@@ -128,9 +140,9 @@ def test_idle_never_hands_over_a_safe_grid(idle):
             break
 
 
-def test_episode_that_ends_inside_reset_is_returned_by_the_first_step():
+def test_episode_that_ends_inside_reset_is_returned_by_the_first_step(engine):
     scenario = next(name for name in list_scenarios("bus14", "bundled") if "rte_case14" not in name)
-    with make("bus14-T0", split="bundled", heuristic="idle", maintenance=False) as environment:
+    with make("bus14-T0", engine=engine, split="bundled", heuristic="idle", maintenance=False) as environment:
         observation, info = environment.reset(seed=0, options={"scenario": scenario, "start": 0})
         if not info["over"]:
             pytest.fail("the two-day scenario was expected to be safe from its first to its last step")
@@ -192,8 +204,8 @@ def test_wrong_discrete_action_is_refused(plain, action, message):
         (np.array([0, 0, 1.5, 0, 0, 0], np.float32), "must lie in"),
     ],
 )
-def test_wrong_continuous_action_is_refused(action, message):
-    with make("bus14-R") as environment:
+def test_wrong_continuous_action_is_refused(engine, action, message):
+    with make("bus14-R", engine=engine) as environment:
         environment.reset(seed=0)
         with pytest.raises(UsageError, match=message):
             environment.unwrapped.step(action)
@@ -212,8 +224,8 @@ def test_observation_slices_cover_the_observation(plain):
     assert sum(s.stop - s.start for s in slices.values()) == plain.observation_space.shape[0]
 
 
-def test_physical_units_on_request():
-    with make("bus14-T0", normalize=None) as environment:
+def test_physical_units_on_request(engine):
+    with make("bus14-T0", engine=engine, normalize=None) as environment:
         observation, _ = environment.reset(seed=0)
         slices = environment.unwrapped.observation_slices
         np.testing.assert_array_equal(observation[slices["gen_p"]], environment.unwrapped._player.state.gen_p[0])

@@ -64,7 +64,7 @@ def test_unknown_id_is_refused_with_what_is_allowed(task_id, message):
 @pytest.mark.parametrize(
     ("keyword", "value", "allowed"),
     [
-        ("engine", "fast", "reference"),
+        ("engine", "fast", "native, reference"),
         ("heuristic", "lazy", "None, idle, recovery"),
         ("split", "dev", "train, validation, test, bundled"),
         ("normalize", "zscore", "physical, None"),

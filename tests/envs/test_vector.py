@@ -1,4 +1,4 @@
-"""The vector environment plays what single environments play, in any number of processes."""
+"""The vector environment of the reference engine plays what single environments play, in any number of processes."""
 
 import gymnasium
 import numpy as np
@@ -6,9 +6,11 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 import rl2grid  # noqa: F401 - registers the tasks
+from rl2grid.envs.vector import PowerGridVectorEnv
 from rl2grid.errors import UsageError
 
-KEYWORDS = {"heuristic": "idle", "gamma": 0.99}
+KEYWORDS = {"engine": "reference", "gamma": 0.99}
+STEPS = 40
 
 
 def make_vector(num_envs, num_workers, task_id="rl2grid/bus14-T0-v0", **keywords):
@@ -41,12 +43,12 @@ def test_made_by_gymnasium_with_autoreset_in_the_same_step():
 
 def test_processes_and_batch_size_do_not_matter():
     inside, workers, fewer = make_vector(3, 0), make_vector(3, 2), make_vector(2, 1)
-    a, b = play(inside, 25), play(workers, 25)
+    a, b = play(inside, STEPS), play(workers, STEPS)
     for x, y in zip(a[:3], b[:3], strict=True):
         np.testing.assert_array_equal(x, y)
     assert a[2].any(), "no episode ended: the test did not see an autoreset"
     fewer.reset(seed=5)
-    for step in range(25):
+    for step in range(STEPS):
         observation = fewer.step(actions_of(step, 3)[:2])[0]
         np.testing.assert_array_equal(observation, a[0][step + 1, :2])
     for vector in (inside, workers, fewer):
@@ -60,7 +62,7 @@ def test_equals_single_environments_and_shows_the_ending():
     for i, single in enumerate(singles):
         np.testing.assert_array_equal(single.reset(seed=5 + i)[0], observations[i])
     endings = 0
-    for step in range(25):
+    for step in range(STEPS):
         actions = actions_of(step, 2)
         observations, rewards, terminated, truncated, infos = vector.step(actions)
         for i, single in enumerate(singles):
@@ -99,7 +101,7 @@ def test_state_is_restored_by_playing_again():
 
 
 def test_masks_are_those_of_the_rules():
-    vector = make_vector(2, 0, "rl2grid/bus36-M-T0-v0", heuristic=None)
+    vector = make_vector(2, 0, "rl2grid/bus36-M-T0-v0")
     vector.reset(seed=0)
     assert vector.action_masks().all()
     vector.step([1, 0])
@@ -139,9 +141,14 @@ def test_dead_worker_is_reported():
     vector.close()
 
 
-@pytest.mark.parametrize("keywords", [{"num_envs": 0}, {"num_envs": 2, "num_workers": -1}])
-def test_wrong_sizes_are_refused(keywords):
-    from rl2grid.envs.vector import PowerGridVectorEnv
-
-    with pytest.raises(UsageError, match="is not allowed"):
-        PowerGridVectorEnv("rl2grid/bus14-T0-v0", **keywords)
+@pytest.mark.parametrize(
+    ("keywords", "message"),
+    [
+        ({"num_envs": 0}, "num_envs=0 is not allowed"),
+        ({"num_envs": 2, "num_workers": -1}, "num_workers=-1 is not allowed"),
+        ({"num_envs": 2, "num_threads": 2}, "num_threads=2 is not for engine='reference': give num_workers"),
+    ],
+)
+def test_wrong_sizes_are_refused(keywords, message):
+    with pytest.raises(UsageError, match=message):
+        PowerGridVectorEnv("rl2grid/bus14-T0-v0", engine="reference", **keywords)

@@ -22,6 +22,7 @@ from rl2grid.algorithms import ppo
 from rl2grid.algorithms.checkpoint import save_checkpoint
 from rl2grid.analysis.episodes import EPISODES_FILE, Episode, read_episodes
 from rl2grid.analysis.results import EVALUATION_FILE, EvaluationResult, load_evaluation
+from rl2grid.engines import ENGINES
 from rl2grid.envs.registration import register_all
 from rl2grid.errors import UsageError
 from rl2grid.experiments.episode import play_episode
@@ -253,11 +254,14 @@ def test_recovery_refuses_tasks_without_topology():
         evaluate("recovery", "bus14-R")
 
 
-def test_bus14_rows_agree_with_the_environment(tmp_path):
-    result = evaluate(RandomAgent(), "bus14-T0", seeds=(0, 1), heuristic="idle", output=tmp_path / "out")
+@pytest.mark.parametrize("engine", ENGINES)
+def test_bus14_rows_agree_with_the_environment(tmp_path, engine):
+    options = {"seeds": (0, 1), "heuristic": "idle", "engine": engine, "workers": 0}
+    result = evaluate(RandomAgent(), "bus14-T0", output=tmp_path / "out", **options)
     assert load_evaluation(tmp_path / "out").episodes == result.episodes
     assert len(result.episodes) == 2 * result.summary.scenarios
     assert result.identity["task"] == "rl2grid/bus14-T0-v0"
+    assert result.identity["engine"] == engine == result.episodes[0].engine
     assert len(result.identity["scenario_pack_hash"]) == len(result.identity["action_set_hash"]) == 16
     for episode in result.episodes:
         assert episode.return_survive == episode.grid_steps - (not episode.completed)
@@ -265,14 +269,16 @@ def test_bus14_rows_agree_with_the_environment(tmp_path):
         assert (episode.survival == 1) == episode.completed == (episode.game_over == "NONE")
         weighted = episode.return_survive + 0.5 * episode.return_overload + 0.5 * episode.return_cost
         assert episode.episode_return == pytest.approx(weighted)
-    means = validator("bus14-T0", seeds=(0, 1), heuristic="idle")(RandomAgent())
+    means = validator("bus14-T0", **options)(RandomAgent())
     assert means["survival"] == result.summary.survival.value
     assert means["episodic_return"] == result.summary.episode_return.value
 
 
-def test_the_final_info_counts_what_was_added_up():
+@pytest.mark.parametrize("engine", ENGINES)
+def test_the_final_info_counts_what_was_added_up(engine):
     register_all()
-    env = gymnasium.make("rl2grid/bus14-T0-v0", heuristic="recovery", split="validation", disable_env_checker=True)
+    keywords = {"engine": engine, "heuristic": "recovery", "split": "validation"}
+    env = gymnasium.make("rl2grid/bus14-T0-v0", disable_env_checker=True, **keywords)
     agent = RandomAgent()
     agent.bind(env)
     last = {}
@@ -299,7 +305,7 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     register_all()
     arguments = hyperparameters("ppo", "bus14-T0", num_envs=1, seed=3)
     keywords = {"heuristic": "idle", "normalize": "physical"}
-    envs = gymnasium.make_vec("rl2grid/bus14-T0-v0", num_envs=1, num_workers=0, gamma=arguments.gamma, **keywords)
+    envs = gymnasium.make_vec("rl2grid/bus14-T0-v0", num_envs=1, gamma=arguments.gamma, **keywords)
     trainer = ppo.PPO(arguments, envs)
     path = tmp_path_factory.mktemp("run") / "checkpoint.pt"
     contents = {

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import gymnasium
 import numpy as np
+import pytest
 from fake_grid import FakeGrid
 
 from rl2grid.agents.do_nothing import DoNothing
 from rl2grid.agents.random_agent import RandomAgent
+from rl2grid.engines import ENGINES
 from rl2grid.envs.registration import register_all
 from rl2grid.experiments.recording import record_episode
 from rl2grid.scenarios.library import list_scenarios
@@ -39,9 +41,11 @@ def test_an_episode_lost_inside_reset_is_recorded():
     assert recorded.n_steps >= 1
 
 
-def test_bus14():
+@pytest.mark.parametrize("engine", ENGINES)
+def test_bus14(engine):
     register_all()
-    env = gymnasium.make("rl2grid/bus14-T0-v0", split="validation", heuristic="idle", disable_env_checker=True)
+    keywords = {"engine": engine, "split": "validation", "heuristic": "idle"}
+    env = gymnasium.make("rl2grid/bus14-T0-v0", disable_env_checker=True, **keywords)
     agent = DoNothing()
     agent.bind(env)
     scenario = list_scenarios("bus14", "validation")[0]

@@ -104,7 +104,7 @@ def test_a_run_folder_holds_everything_about_the_run(tmp_path: Path):
     assert present == {"config.json", "metrics.csv", "tensorboard", "checkpoint.pt", "best.pt", "log.txt"}
     config = json.loads((folder / "config.json").read_text())
     assert config["identity"]["task"] == "rl2grid/bus14-T0-v0"
-    assert config["identity"]["engine"] == "reference"
+    assert config["identity"]["engine"] == "native"
     assert {"grid_hash", "scenario_pack_hash", "action_set_hash", "seed", "versions"} <= config["identity"].keys()
     assert config["request"]["env_keywords"]["normalize"] == "physical"  # defaults are spelt out
     assert config["request"]["hyperparameters"]["seed"] == 5
@@ -424,31 +424,42 @@ def test_a_run_killed_at_random_moments_ends_like_one_that_was_not(tmp_path: Pat
     assert_same_run(tmp_path / "run", straight)
 
 
-@pytest.mark.parametrize("task", ["bus14-T0", "bus14-R"])
-def test_a_run_on_the_grid_broken_off_and_resumed_ends_like_one_that_was_not(tmp_path: Path, task: str):
+@pytest.mark.parametrize(
+    ("task", "engine", "sizes"),
+    [
+        ("bus14-T0", "native", {"num_envs": 20, "num_steps": 8}),
+        ("bus14-R", "native", {"num_envs": 20, "num_steps": 8}),
+        ("bus14-T0", "reference", {"num_envs": 2, "num_steps": 2}),
+    ],
+)
+def test_a_run_on_the_grid_broken_off_and_resumed_ends_like_one_that_was_not(
+    tmp_path: Path, task: str, engine: str, sizes: dict[str, int]
+):
+    iteration = sizes["num_envs"] * sizes["num_steps"]
+
     class BrokenOffError(Exception):
         pass
 
     def break_off(agent: PolicyAgent) -> Mapping[str, float]:
-        if agent.identity["decisions"] == 12:  # after two saved iterations, in the middle of the third
+        if agent.identity["decisions"] == 3 * iteration:  # after two saved iterations, in the middle of the third
             raise BrokenOffError
         return {"survival": 0.0}
 
     def validate(agent: PolicyAgent) -> Mapping[str, float]:
         return {"survival": 0.0}
 
-    sizes = {"num_envs": 2, "num_steps": 2, "total_timesteps": 16, "update_epochs": 2}
+    sizes = {**sizes, "total_timesteps": 4 * iteration, "update_epochs": 2}
     changes = {
         "task": task,
         "hyperparameters": hyperparameters("ppo", task, seed=1, **sizes),
-        "env_keywords": {"heuristic": "idle"},
-        "num_workers": 0,
-        "evaluate_every": 4,
+        "env_keywords": {"engine": engine, "heuristic": "idle"},
+        "num_workers": 0 if engine == "reference" else None,
+        "evaluate_every": iteration,
     }
     straight = train(request(tmp_path / "straight", **changes), evaluate=validate)
     with pytest.raises(BrokenOffError):
         train(request(tmp_path / "run", **changes), evaluate=break_off)
-    assert load_checkpoint(tmp_path / "run" / "checkpoint.pt")["decisions"] == 8
+    assert load_checkpoint(tmp_path / "run" / "checkpoint.pt")["decisions"] == 2 * iteration
     resume(tmp_path / "run", evaluate=validate)
     assert_same_run(tmp_path / "run", straight)
-    assert load_checkpoint(straight / "checkpoint.pt")["training"]["grid_steps"] > 16
+    assert load_checkpoint(straight / "checkpoint.pt")["training"]["grid_steps"] > 4 * iteration

@@ -601,7 +601,7 @@ class PPO:
             "iteration": self.iteration,
             "decisions": self.decisions,
             "grid_steps": self.grid_steps,
-            "observations": self._observations,
+            "observations": np.array(self._observations),
             "over": self._over,
             "episode_return": self._episode_return,
             "episode_length": self._episode_length,

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import os
 import shlex
 from pathlib import Path
 
 from rich.console import Console
 
 from rl2grid.analysis.tables import rich_table
+from rl2grid.engines import ENGINES
 from rl2grid.envs.tasks import find_task
 from rl2grid.experiments.evaluation import AS_TRAINED, evaluate
 
@@ -29,7 +29,8 @@ def run(options: argparse.Namespace) -> int:
         split=options.split,
         seeds=range(options.seeds),
         heuristic=heuristic,
-        workers=(os.cpu_count() or 1) if options.workers is None else options.workers,
+        engine=options.engine,
+        workers=options.workers,
         output=output,
         progress=True,
         command=_command(options),
@@ -42,6 +43,8 @@ def run(options: argparse.Namespace) -> int:
 def _default_output(options: argparse.Namespace, task: str) -> Path:
     """Inside the run for one of its policies; else by task and agent."""
     name = options.split if options.heuristic is None else f"{options.split}-{options.heuristic}"
+    if options.engine != ENGINES[0]:
+        name = f"{name}-{options.engine}"
     path = Path(options.agent)
     if path.is_dir():
         return path / "evaluation" / name
@@ -55,4 +58,6 @@ def _command(options: argparse.Namespace) -> str:
     words += ["--seeds", str(options.seeds)]
     if options.heuristic is not None:
         words += ["--heuristic", options.heuristic]
+    if options.engine != ENGINES[0]:
+        words += ["--engine", options.engine]
     return shlex.join(words)

@@ -14,7 +14,7 @@ from typing import NoReturn
 
 from rl2grid import __version__
 from rl2grid.cli.train import INTERRUPTED, train
-from rl2grid.engines import HEURISTICS
+from rl2grid.engines import ENGINES, HEURISTICS
 from rl2grid.errors import UsageError
 from rl2grid.scenarios.library import SPLITS
 
@@ -68,14 +68,13 @@ def _add_demo(commands: argparse._SubParsersAction[_Parser]) -> None:
     parser = commands.add_parser("demo", help="train PPO on bus14, evaluate it beside simple agents, write a report")
     parser.add_argument("--output", type=Path, default=Path("reports/demo"), help="folder of the report")
     parser.add_argument("--decisions", type=int, default=None, help="decisions to train for")
-    parser.add_argument("--workers", type=int, default=None, help="processes; by default one per core")
     parser.set_defaults(run=_demo)
 
 
 def _demo(options: argparse.Namespace) -> int:
     from rl2grid.experiments.demo import run_demo
 
-    run_demo(options.output, decisions=options.decisions, workers=options.workers)
+    run_demo(options.output, decisions=options.decisions)
     return 0
 
 
@@ -99,7 +98,10 @@ def _add_evaluate(commands: argparse._SubParsersAction[_Parser]) -> None:
     parser.add_argument("--split", default="validation", choices=SPLITS, help="validation picks models; test is last")
     parser.add_argument("--seeds", type=int, default=1, help="episodes per scenario, with seeds 0, 1, ...")
     parser.add_argument("--heuristic", default=None, choices=("None", *HEURISTICS), help="by default the agent's own")
-    parser.add_argument("--workers", type=int, default=None, help="processes; by default one per core")
+    parser.add_argument("--engine", default=ENGINES[0], choices=ENGINES, help="native (default), or Grid2Op itself")
+    parser.add_argument(
+        "--workers", type=int, default=None, help="processes; by default this one (native) or one per core (reference)"
+    )
     parser.add_argument("--output", type=Path, default=None, help="folder of the results")
     parser.set_defaults(run=_evaluate)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import difflib
 import io
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import Field, dataclass, fields, make_dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from rl2grid.errors import UsageError, one_of
 if TYPE_CHECKING:
     from rl2grid.algorithms.policy_agent import PolicyAgent
     from rl2grid.algorithms.ppo import Args
+    from rl2grid.experiments.runs import RunArgs
 
 INTERRUPTED = 130
 """Exit status after an interrupt, as shells have it."""
@@ -43,20 +43,27 @@ class TrainFlags:
     """What plays while the grid is safe: None, ``idle`` or ``recovery``."""
     reward: str = "default"
     """Reward preset: ``default``, ``paper`` or ``released``."""
+    engine: str = "native"
+    """``native``, or ``reference``: Grid2Op itself."""
     dispatch: str = "exact"
     """``exact`` or ``grid2op``."""
     maintenance: bool = True
     """Whether planned maintenance happens."""
     opponent: bool = True
     """Whether the grid's opponent attacks."""
+    num_threads: int | None = None
+    """Native engine: threads that play the environments; None: one per processor core. No influence on results."""
     num_workers: int | None = None
-    """Processes that play the environments; None: one per processor core. No influence on results."""
+    """Reference engine: processes that play them; None: one per processor core. No influence on results."""
     evaluate_every: int = 50_000
     """Decisions between two evaluations on the validation scenarios."""
     validate: bool = True
     """Whether the best policy is picked on the validation scenarios."""
     checkpoint_seconds: float = 60.0
     """A checkpoint is written when the last one is older than this, and at the end."""
+
+
+_ENV_KEYWORDS = ("engine", "heuristic", "reward", "dispatch", "maintenance", "opponent")
 
 
 def train(command_line: list[str]) -> int:
@@ -82,7 +89,7 @@ def _resume(arguments: list[str]) -> int:
     from rl2grid.experiments import runs
 
     args, _ = runs.read_config(Path(arguments[0]))
-    folder = runs.resume(Path(arguments[0]), evaluate=_validator(args.task, args.num_workers))
+    folder = runs.resume(Path(arguments[0]), evaluate=_validator(args))
     return _report(folder, args.task)
 
 
@@ -98,7 +105,7 @@ def _begin(algorithm: str, task_id: str, flags: list[str]) -> int:
     hyperparameters = runs.hyperparameters(algorithm, task.id, _preset(flags))
     _refuse_unknown(flags, [*fields(TrainFlags), *fields(chosen.args)])
     own, hyperparameters = _parse(f"rl2grid train {algorithm} {task.id}", flags, hyperparameters)
-    keywords = {name: getattr(own, name) for name in ("heuristic", "reward", "dispatch", "maintenance", "opponent")}
+    keywords = {name: getattr(own, name) for name in _ENV_KEYWORDS}
     TaskOptions(**keywords)
     args = runs.RunArgs(
         task=task.id,
@@ -106,11 +113,12 @@ def _begin(algorithm: str, task_id: str, flags: list[str]) -> int:
         algorithm=algorithm,
         folder=own.folder,
         env_keywords=keywords,
+        num_threads=own.num_threads,
         num_workers=own.num_workers,
         checkpoint_seconds=own.checkpoint_seconds,
         evaluate_every=own.evaluate_every,
     )
-    folder = runs.train(args, evaluate=_validator(task.id, own.num_workers) if own.validate else None)
+    folder = runs.train(args, evaluate=_validator(args) if own.validate else None)
     return _report(folder, task.id)
 
 
@@ -176,7 +184,7 @@ def _refuse_unknown(flags: list[str], known: list[Field[Any]]) -> None:
         raise UsageError(f"Flag {name} does not exist: {hint}")
 
 
-def _validator(task_id: str, workers: int | None) -> Callable[[PolicyAgent], Mapping[str, float]]:
+def _validator(args: RunArgs) -> Callable[[PolicyAgent], Mapping[str, float]]:
     from rl2grid.experiments.evaluation import validator
 
-    return validator(task_id, workers=(os.cpu_count() or 1) if workers is None else workers)
+    return validator(args.task, engine=args.env_keywords["engine"], workers=args.num_workers)

@@ -79,7 +79,7 @@ class PowerGridEnv(gymnasium.Env[NDArray[np.float32], Any], TaskDescription):
         self,
         task_id: str,
         *,
-        engine: str = "reference",
+        engine: str = "native",
         heuristic: str | None = None,
         reward: str | tuple[float, float, float] | Callable[..., Any] = "default",
         split: str = "train",

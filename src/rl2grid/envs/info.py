@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from rl2grid.envs.tasks import CONSTRAINTS
 from rl2grid.mdp.scores import SCORES
 from rl2grid.mdp.state import GridState
@@ -54,6 +57,11 @@ INFO_KEYS: tuple[InfoKey, ...] = (
 )
 
 
+_GAME_OVER_WORDS = np.array(
+    [f"{reason.name}: {GAME_OVER_TEXT[reason]}" if reason else "" for reason in GameOver], dtype=object
+)
+
+
 def episode_info(state: GridState, i: int, constraint: str | None) -> dict[str, Any]:
     """What the state alone tells about environment ``i``; see :data:`INFO_KEYS`."""
     costs = _named(CONSTRAINTS, state.transition_costs[i])
@@ -77,7 +85,34 @@ def episode_info(state: GridState, i: int, constraint: str | None) -> dict[str, 
         "ambiguous": bool(state.ambiguous[i]),
         "attacked_lines": state.attacked[i].copy(),
         "game_over": int(reason),
-        "game_over_text": f"{reason.name}: {GAME_OVER_TEXT[reason]}" if reason else "",
+        "game_over_text": _GAME_OVER_WORDS[reason],
+    }
+
+
+def batch_info(state: GridState, constraint: str | None) -> dict[str, Any]:
+    """:func:`episode_info` of all environments at once: arrays [n], dicts of arrays, and object [n] for words."""
+    costs = _named_columns(CONSTRAINTS, state.transition_costs)
+    step = state.step.astype(np.int64)
+    survived = np.maximum(step - state.terminated, 0)
+    scored = np.maximum(step - state.terminated, 1)[:, np.newaxis]
+    return {
+        "step": step,
+        "episode_length": state.episode_length.astype(np.int64),
+        "survival": survived / state.episode_length,
+        "decisions": state.decisions.astype(np.int64),
+        "n_steps": state.n_steps.astype(np.int64),
+        "reward_components": _named_columns(COMPONENTS, state.transition_components),
+        "cost": costs[constraint] if constraint else state.transition_costs.sum(axis=1),
+        "costs": costs,
+        "episode_return": state.episode_return.copy(),
+        "episode_components": _named_columns(COMPONENTS, state.episode_components),
+        "episode_costs": _named_columns(CONSTRAINTS, state.episode_costs),
+        "scores": _named_columns(SCORES, state.episode_scores / scored),
+        "illegal": state.illegal.copy(),
+        "ambiguous": state.ambiguous.copy(),
+        "attacked_lines": state.attacked.copy(),
+        "game_over": state.game_over.astype(np.int64),
+        "game_over_text": _GAME_OVER_WORDS[state.game_over],
     }
 
 
@@ -89,3 +124,7 @@ def survival(state: GridState, i: int) -> float:
 
 def _named(names: tuple[str, ...], values: Any) -> dict[str, float]:
     return {name: float(value) for name, value in zip(names, values, strict=True)}
+
+
+def _named_columns(names: tuple[str, ...], values: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+    return {name: values[:, column].copy() for column, name in enumerate(names)}

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rl2grid.engines.base import Engine
-from rl2grid.engines.effects import clipping, refusal
+from rl2grid.engines.effects import clipping, cooldown_left, refusal
 from rl2grid.engines.transition import Transitions
 from rl2grid.envs.info import episode_info
 from rl2grid.envs.tasks import Task, TaskOptions
@@ -61,11 +61,22 @@ class SimulationResult:
     info: dict[str, Any]
 
 
-def make_engine(grid: Grid, n: int, options: TaskOptions) -> Engine:
-    """The engine that ``options`` asks for."""
-    from rl2grid.engines.reference.engine import ReferenceEngine
+def make_transitions(task: Task, options: TaskOptions, n: int) -> Transitions:
+    """The transitions of ``n`` environments on the engine that ``options`` asks for."""
+    reward = resolve_reward(options.reward)
+    gamma = 1.0 if options.gamma is None else options.gamma
+    topology_task = task.kind == "T"
+    # Engines are imported here: each loads much that the other does not need.
+    if options.engine == "reference":
+        from rl2grid.engines.reference.engine import ReferenceEngine
 
-    return ReferenceEngine(grid, n, options.dispatch, options.opponent)
+        reference = ReferenceEngine(task.grid, n, options.dispatch, options.opponent)
+        return Transitions(reference, options.heuristic, topology_task, reward, gamma)
+    from rl2grid.engines.native.engine import NativeEngine
+    from rl2grid.engines.native.transitions import NativeTransitions
+
+    native = NativeEngine(task.grid, n, options.dispatch, options.opponent)
+    return NativeTransitions(native, options.heuristic, topology_task, reward, gamma)
 
 
 class TaskPlayer:
@@ -74,12 +85,12 @@ class TaskPlayer:
     def __init__(self, task: Task, options: TaskOptions, n: int) -> None:
         self.task, self.options, self.grid = task, options, task.grid
         self.constraint = task.constraint or options.constraint
-        reward = resolve_reward(options.reward)
-        self.engine = make_engine(self.grid, n, options)
-        gamma = 1.0 if options.gamma is None else options.gamma
-        self.transitions = Transitions(self.engine, options.heuristic, task.kind == "T", reward, gamma)
+        self.transitions = make_transitions(task, options, n)
+        self.engine: Engine = self.transitions.engine
         self._write_observation = observation_writer(task.kind)
-        self._shift, self._scale = physical_scale(self.grid, task.kind)
+        shift, scale = physical_scale(self.grid, task.kind)
+        physical = options.normalize == "physical"
+        self._normaliser = (shift, scale) if physical else (np.zeros_like(shift), np.ones_like(scale))
         self._catalogue = level_catalogue(self.grid, task.level) if task.kind == "T" else None
         self._hash = action_set_hash(self.grid, task.level) if task.kind == "T" else None
         self._plans: list[EpisodePlan | None] = [None] * n
@@ -96,10 +107,7 @@ class TaskPlayer:
         Raises:
             UsageError: an option is unknown, or names a scenario or start that does not exist.
         """
-        seat = self._next_seat(i, seed, options or {})
-        plan = self._plan(seat)
-        self._seats[i], self._plans[i] = seat, plan
-        self.transitions.reset(i, plan)
+        self.transitions.reset(i, self._take_seat(i, seed, options))
         self._pending[i] = self.is_over(i)
 
     def step(self, i: int, action: Any) -> None:
@@ -158,7 +166,7 @@ class TaskPlayer:
         plan, played = self._plans[i], self._step_action(action)
         if plan is None or self.is_over(i):
             raise UsageError("There is no episode in progress to simulate from: call reset first.")
-        effect = refusal(self.state, i, played)
+        effect = refusal(played, cooldown_left(self.state, i, played))
         result = self.transitions.simulate(i, played, horizon)
         observation = np.zeros(observation_size(self.grid, self.task.kind), np.float32)
         self._observe(result, 0, observation)
@@ -199,6 +207,13 @@ class TaskPlayer:
             raise UsageError("The environment was not reset yet: call reset first.")
         return seat
 
+    def _take_seat(self, i: int, seed: int | None, options: dict[str, Any] | None) -> EpisodePlan:
+        """Move row ``i`` to its next episode, and say which that is."""
+        seat = self._next_seat(i, seed, options or {})
+        plan = self._plan(seat)
+        self._seats[i], self._plans[i] = seat, plan
+        return plan
+
     def _next_seat(self, i: int, seed: int | None, options: dict[str, Any]) -> Seat:
         for name in options:
             if name not in _RESET_OPTIONS:
@@ -224,10 +239,10 @@ class TaskPlayer:
         )
 
     def _observe(self, state: GridState, i: int, out: NDArray[np.float32]) -> None:
+        shift, scale = self._normaliser
         self._write_observation(state, i, out)
-        if self.options.normalize == "physical":
-            out -= self._shift
-            out /= self._scale
+        out -= shift
+        out /= scale
 
     def _step_action(self, action: Any) -> StepAction:
         if self._catalogue is None:

@@ -98,8 +98,8 @@ class TaskOptions:
         UsageError: a value is not allowed; the message lists those that are.
     """
 
-    engine: str = "reference"
-    """``"reference"``: Grid2Op with LightSim2Grid."""
+    engine: str = "native"
+    """``"native"``: ours, compiled; ``"reference"``: Grid2Op with LightSim2Grid."""
     heuristic: str | None = None
     """What plays while the grid is safe: None (the agent decides every step), ``"idle"`` or ``"recovery"``."""
     reward: str | tuple[float, float, float] | Callable[..., Any] = "default"

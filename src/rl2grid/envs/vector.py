@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -19,20 +19,28 @@ from rl2grid.envs.tasks import TaskOptions, find_task
 from rl2grid.envs.worker import RemoteRows
 from rl2grid.errors import UsageError
 
+if TYPE_CHECKING:
+    from rl2grid.envs.native_player import NativeBatch, NativePlayer
+
 
 class PowerGridVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], Any, NDArray[Any]], TaskDescription):
-    """``num_envs`` environments of one task, played by worker processes.
+    """``num_envs`` environments of one task, stepped together.
 
     Made by ``gymnasium.make_vec(id, num_envs=n, ...)`` with the keywords of
-    :class:`~rl2grid.envs.grid_env.PowerGridEnv` and ``num_workers``. An ended episode makes way for the
-    next one in the same step (``AutoresetMode.SAME_STEP``): its last observation and info are
-    ``infos["final_obs"][i]`` and ``infos["final_info"]``. ``reset(seed=s)`` gives environment ``i`` the
-    seed ``s + i``; what an environment plays does not depend on ``num_envs`` or ``num_workers``.
+    :class:`~rl2grid.envs.grid_env.PowerGridEnv`, ``num_threads`` (native engine) and ``num_workers`` (reference
+    engine). An ended episode makes way for the next one in the same step (``AutoresetMode.SAME_STEP``): its last
+    observation and info are ``infos["final_obs"][i]`` and ``infos["final_info"]``. ``reset(seed=s)`` gives
+    environment ``i`` the seed ``s + i``; what an environment plays does not depend on the number of
+    environments, threads or workers.
+
+    On the native engine, observations are written into two buffers that take turns: those of a step are
+    valid until the step after the next. ``infos["action_effect"]`` holds objects that are put into words by ``str``.
 
     Args:
         task_id: the task.
         num_envs: number of environments.
-        num_workers: number of processes; 0 plays in this one; None takes one per processor core.
+        num_threads: native engine: threads that share the environments; None takes one per processor core.
+        num_workers: reference engine: number of processes; 0 plays in this one; None takes one per core.
     """
 
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
@@ -42,8 +50,9 @@ class PowerGridVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], Any, ND
         task_id: str,
         num_envs: int = 1,
         *,
+        num_threads: int | None = None,
         num_workers: int | None = None,
-        engine: str = "reference",
+        engine: str = "native",
         heuristic: str | None = None,
         reward: str | tuple[float, float, float] | Callable[..., Any] = "default",
         split: str = "train",
@@ -59,6 +68,8 @@ class PowerGridVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], Any, ND
             raise UsageError(f"num_envs={num_envs!r} is not allowed: give a number of environments, at least 1.")
         if num_workers is not None and (not isinstance(num_workers, int) or num_workers < 0):
             raise UsageError(f"num_workers={num_workers!r} is not allowed: give a number of processes, 0 or more.")
+        if num_threads is not None and (not isinstance(num_threads, int) or num_threads < 1):
+            raise UsageError(f"num_threads={num_threads!r} is not allowed: give a number of threads, 1 or more.")
         self.task = find_task(task_id)
         self.options = TaskOptions(
             engine,
@@ -77,12 +88,26 @@ class PowerGridVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], Any, ND
         self.single_observation_space, self.single_action_space = single_spaces(self.task)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        workers = min(num_envs, os.cpu_count() or 1) if num_workers is None else min(num_envs, num_workers)
-        bounds = np.linspace(0, num_envs, max(workers, 1) + 1).astype(int).tolist()
+        self._native: NativePlayer | None = None
+        self._local: Rows | None = None
+        self._remotes: list[RemoteRows] = []
+        self._slices = [slice(0, num_envs)]
+        if engine == "native":
+            from rl2grid.envs.native_player import NativePlayer
+
+            _refuse("num_workers", num_workers, "num_threads", "native")
+            self._native = NativePlayer(self.task, self.options, num_envs, num_threads)
+            return
+        _refuse("num_threads", num_threads, "num_workers", "reference")
+        self._start_workers(min(num_envs, os.cpu_count() or 1) if num_workers is None else min(num_envs, num_workers))
+
+    def _start_workers(self, workers: int) -> None:
+        if workers == 0:
+            self._local = Rows(self.task.id, self.options, self.num_envs)
+            return
+        bounds = np.linspace(0, self.num_envs, workers + 1).astype(int).tolist()
         self._slices = [slice(first, last) for first, last in itertools.pairwise(bounds)]
-        self._local = Rows(task_id, self.options, num_envs) if workers == 0 else None
-        parts = self._slices if workers else []
-        self._remotes = [RemoteRows(task_id, self.options, part.stop - part.start) for part in parts]
+        self._remotes = [RemoteRows(self.task.id, self.options, part.stop - part.start) for part in self._slices]
         try:
             for remote in self._remotes:
                 remote.receive()
@@ -99,6 +124,8 @@ class PowerGridVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], Any, ND
         )
         if len(seeds) != self.num_envs:
             raise UsageError(f"{len(seeds)} seeds were given for {self.num_envs} environments: give one each.")
+        if self._native is not None:
+            return self._present(self._native.reset_all(seeds, options))
         batch = self._call("reset", [(seeds[s], options) for s in self._slices])
         return batch.observations, self._infos(batch)
 
@@ -110,6 +137,10 @@ class PowerGridVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], Any, ND
         Raises:
             UsageError: an action has the wrong shape or value.
         """
+        if self._native is not None:
+            played = self._native.step_all(actions)
+            observations, infos = self._present(played)
+            return observations, played.rewards, played.terminated, played.truncated, infos
         rows = list(actions)
         if len(rows) != self.num_envs:
             raise UsageError(f"{len(rows)} actions were given for {self.num_envs} environments: give one each.")
@@ -120,10 +151,14 @@ class PowerGridVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], Any, ND
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Which discrete actions are legal now, bool [environment, action]."""
+        if self._native is not None:
+            return self._native.action_masks()
         return np.concatenate(self._ask("action_masks", [() for _ in self._slices]))
 
     def state_dict(self) -> dict[str, Any]:
         """Where every environment is, as plain values: seed, episode number, actions of the episode so far."""
+        if self._native is not None:
+            return {"rows": self._native.state_dict()}
         rows = self._ask("state_dict", [() for _ in self._slices])
         return {"rows": [row for part in rows for row in part]}
 
@@ -136,11 +171,15 @@ class PowerGridVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], Any, ND
         rows = state["rows"]
         if len(rows) != self.num_envs:
             raise UsageError(f"The saved state has {len(rows)} environments, this vector has {self.num_envs}.")
+        if self._native is not None:
+            return self._present(self._native.restore_all(rows))
         batch = self._call("load_state_dict", [(rows[s],) for s in self._slices])
         return batch.observations, self._infos(batch)
 
     def close_extras(self, **kwargs: Any) -> None:
-        """End the workers."""
+        """Free the simulators and end the workers."""
+        if self._native is not None:
+            self._native.close()
         if self._local is not None:
             self._local.close()
         for remote in self._remotes:
@@ -172,8 +211,29 @@ class PowerGridVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], Any, ND
             np.concatenate([part.truncated for part in parts]),
         )
 
+    def _present(self, batch: NativeBatch) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Observations and infos of the native engine as Gymnasium wants them."""
+        infos = _with_masks(batch.info, np.ones(self.num_envs, np.bool_))
+        for i, ending in batch.endings.items():
+            self._add_info(infos, ending, i)
+        return batch.observations, infos
+
     def _infos(self, batch: Batch) -> dict[str, Any]:
         infos: dict[str, Any] = {}
         for i, info in enumerate(batch.infos):
             self._add_info(infos, info, i)
         return infos
+
+
+def _with_masks(info: dict[str, Any], everywhere: NDArray[np.bool_]) -> dict[str, Any]:
+    """Gymnasium's form of infos that every environment has: each key beside a mask, ``everywhere``."""
+    masked: dict[str, Any] = {}
+    for key, value in info.items():
+        masked[key] = _with_masks(value, everywhere) if isinstance(value, dict) else value
+        masked[f"_{key}"] = everywhere
+    return masked
+
+
+def _refuse(keyword: str, value: int | None, instead: str, engine: str) -> None:
+    if value is not None:
+        raise UsageError(f"{keyword}={value!r} is not for engine={engine!r}: give {instead}.")

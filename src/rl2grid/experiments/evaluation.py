@@ -16,6 +16,7 @@ missing. The result depends neither on the number of workers nor on interruption
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -55,7 +56,7 @@ def evaluate(
     seeds: Sequence[int] = (0,),
     start: int = 0,
     heuristic: str | None = AS_TRAINED,
-    workers: int = 0,
+    workers: int | None = None,
     output: Path | None = None,
     progress: bool = False,
     name: str | None = None,
@@ -73,7 +74,8 @@ def evaluate(
         seeds: of maintenance, opponent and agent.
         start: row of each scenario at which its episodes begin.
         heuristic: None, ``"idle"``, ``"recovery"`` or :data:`AS_TRAINED`.
-        workers: processes that play at the same time; 0: this process plays. No influence on results.
+        workers: processes that play at the same time; 0: this process plays; None: this one on the native engine,
+            one per processor core on the reference engine. No influence on results.
         output: folder to store the evaluation in, and to continue it from; None: nothing is stored.
         progress: whether to show a progress bar with rate and remaining time.
         name: what tables call the agent; None: its own name.
@@ -87,14 +89,12 @@ def evaluate(
     chosen = make_agent(agent, task.id) if isinstance(agent, str | Path) else agent
     keywords = _env_keywords(chosen, {**options, "split": split, "heuristic": heuristic})
     jobs = _jobs(_checked_scenarios(task, split, scenarios), seeds, start)
-    if not isinstance(workers, int) or workers < 0:
-        raise UsageError(f"workers={workers!r} is not allowed: give a number of processes, 0 or more.")
     return run_evaluation(
         Setting(task.id, agent, keywords),
         jobs,
         identity=_identity(task, chosen, name or chosen.name, keywords, start),
         command=command or _call(agent, task, keywords, scenarios, seeds, start, name),
-        workers=workers,
+        workers=_number_of_workers(workers, TaskOptions(**keywords).engine),
         output=output,
         progress=progress,
     )
@@ -144,7 +144,7 @@ def validator(
     *,
     seeds: Sequence[int] = (0,),
     scenarios: Sequence[str] | None = None,
-    workers: int = 0,
+    workers: int | None = None,
     **options: Any,
 ) -> Callable[[Agent], dict[str, float]]:
     """A function that plays the validation scenarios with an agent and returns means over episodes.
@@ -181,6 +181,15 @@ def _env_keywords(agent: Agent, keywords: dict[str, Any]) -> dict[str, Any]:
         raise UsageError(f"Option {unknown[0]!r} does not exist: choose from {allowed}.")
     TaskOptions(**keywords)
     return keywords
+
+
+def _number_of_workers(workers: int | None, engine: str) -> int:
+    if workers is None:
+        # A native episode is over before another process has started.
+        return 0 if engine == "native" else os.cpu_count() or 1
+    if not isinstance(workers, int) or workers < 0:
+        raise UsageError(f"workers={workers!r} is not allowed: give a number of processes, 0 or more.")
+    return workers
 
 
 def _checked_scenarios(task: Task, split: str, scenarios: Sequence[str] | None) -> tuple[str, ...]:

@@ -22,13 +22,12 @@ from typing import Any, BinaryIO, NamedTuple, Protocol, Self
 
 import gymnasium
 
-from rl2grid.agents.agent import Agent
+from rl2grid.agents.agent import Action, Agent, Info
 from rl2grid.envs.registration import register_all
 from rl2grid.envs.worker import take_standard_streams
 from rl2grid.errors import UsageError
 from rl2grid.experiments.agents import make_agent
 from rl2grid.experiments.episode import PlayedEpisode, play_episode
-from rl2grid.mdp.state import GridState
 
 _REPORT_SECONDS = 0.5
 
@@ -73,7 +72,7 @@ class Players(Protocol):
     """Plays episodes and tells of them as they go."""
 
     def play(self, jobs: Sequence[Job], on_progress: OnProgress) -> Iterator[PlayedEpisode]:
-        """Play all jobs, in no particular order; ``on_progress`` is told of running ones twice a second.
+        """Play all jobs, in no particular order; ``on_progress`` is told of running ones at most twice a second.
 
         Raises:
             UsageError: the environment or the agent cannot be made, or do not fit.
@@ -110,18 +109,15 @@ class Player:
         """Play an episode."""
         told = time.monotonic()
 
-        def hear(state: GridState, row: int) -> None:
+        def tell(action: Action, info: Info) -> None:
             nonlocal told
             if time.monotonic() - told >= _REPORT_SECONDS:
                 told = time.monotonic()
-                on_progress(Progress(job, int(state.step[row]), int(state.episode_length[row])))
+                on_progress(Progress(job, int(info["step"]), int(info["episode_length"])))
 
-        listeners: list[Callable[[GridState, int], None]] = self._env.unwrapped.step_listeners  # type: ignore[attr-defined]
-        listeners.append(hear)
-        try:
-            return play_episode(self._agent, self._env, scenario=job.scenario, seed=job.seed, start=job.start)
-        finally:
-            listeners.remove(hear)
+        return play_episode(
+            self._agent, self._env, scenario=job.scenario, seed=job.seed, start=job.start, on_decision=tell
+        )
 
     def close(self) -> None:
         """Free the environment."""

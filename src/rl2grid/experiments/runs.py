@@ -82,8 +82,10 @@ class RunArgs:
     """Where the run is written, a folder that does not exist yet; None: ``runs/<task>-<algorithm>-<seed>``."""
     env_keywords: Mapping[str, Any] = field(default_factory=dict)
     """Keywords of ``gymnasium.make_vec`` (``heuristic``, ``reward``, ...); ``gamma`` is the algorithm's."""
+    num_threads: int | None = None
+    """Native engine: threads that play the environments; None: one per processor core. No influence on results."""
     num_workers: int | None = None
-    """Processes that play the environments; None: one per processor core, 0: this one. No influence on results."""
+    """Reference engine: processes that play them; None: one per core, 0: this one. No influence on results."""
     checkpoint_seconds: float = 60.0
     """A checkpoint is written when the last one is older than this, and at the end."""
     evaluate_every: int = 50_000
@@ -114,6 +116,7 @@ def make_envs(args: RunArgs) -> VectorEnvironment:
     return gymnasium.make_vec(
         find_task(args.task).id,
         num_envs=args.hyperparameters.num_envs,
+        num_threads=args.num_threads,
         num_workers=args.num_workers,
         gamma=args.hyperparameters.gamma,
         **args.env_keywords,
