@@ -100,7 +100,7 @@ class AdversarialTopology:
         if self._random.random() < self._peace:
             return DO_NOTHING
         for k in self._random.permutation(len(self._tricks)).tolist():
-            action = self._tricks[k](state, i)
+            action: StepAction = self._tricks[k](state, i)
             if action is not DO_NOTHING:
                 return action
         return DO_NOTHING

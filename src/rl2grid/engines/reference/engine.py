@@ -161,11 +161,14 @@ class ReferenceEngine:
 
     def _is_impossible(self, i: int, action: StepAction) -> bool:
         """Whether the redispatch of an action can never be carried out, which makes it illegal."""
-        if action.kind != ActionKind.INJECTION or action.values is None:
-            return False
+        if action.kind == ActionKind.INJECTION and action.values is not None:
+            request = decode_continuous(self.grid, action.values).redispatch
+        else:
+            # A refused request may leave a target out of reach by a rounding error: Grid2Op then refuses "nothing" too.
+            request = np.zeros(self.grid.n_gen, np.float32)
         environment = self._environments[i]
         return redispatch_is_impossible(
-            decode_continuous(self.grid, action.values).redispatch,
+            request,
             environment._target_dispatch,
             environment._actual_dispatch,
             environment._already_modified_gen,
