@@ -21,6 +21,7 @@ class Purpose(enum.IntEnum):
     MAINTENANCE = 2
     OPPONENT = 3
     AGENT = 4
+    SERIES = 5
 
 
 class Stream:

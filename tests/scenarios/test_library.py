@@ -7,7 +7,7 @@ import pytest
 
 from rl2grid.errors import UsageError
 from rl2grid.grids import GRID_IDS
-from rl2grid.scenarios.library import SPLITS, list_scenarios, load_scenario, scenario_pack_hash
+from rl2grid.scenarios.library import RECORDED_SPLITS, list_scenarios, load_scenario, scenario_pack_hash
 
 TEST_PACKS = {
     "bus14": "37b9a19e5caea675",
@@ -35,7 +35,7 @@ def test_names_are_readable() -> None:
 
 
 @pytest.mark.parametrize("grid_id", GRID_IDS)
-@pytest.mark.parametrize("split", SPLITS)
+@pytest.mark.parametrize("split", RECORDED_SPLITS)
 def test_every_listed_scenario_loads(grid_id: str, split: str) -> None:
     for scenario_id in list_scenarios(grid_id, split):
         scenario = load_scenario(grid_id, scenario_id)
@@ -66,7 +66,8 @@ def test_a_window_is_part_of_its_series() -> None:
     ("scenario_id", "message"),
     [
         ("0000", "must look like bundled/0000"),
-        ("generated/7", "must look like bundled/0000"),
+        ("generated/7", "must look like 17-03"),
+        ("made/7", "must look like bundled/0000"),
         ("bundled/0000[5]", "must look like bundled/0000"),
         ("bundled/0003", "choose one of bundled/0000, bundled/0001, bundled/0002, bundled/rte_case14_realistic/000"),
         ("bundled/0000[0:577]", "at least 2 of the rows 0 to 576"),
@@ -85,14 +86,14 @@ def test_unknown_grids_and_splits_are_refused() -> None:
         list_scenarios("bus15", "train")
     with pytest.raises(UsageError, match="choose one of bus14, bus36-M"):
         load_scenario("bus15", "bundled/0000")
-    with pytest.raises(UsageError, match="choose one of train, validation, test, bundled"):
+    with pytest.raises(UsageError, match="choose one of train, validation, test, bundled, generated-train, "):
         scenario_pack_hash("bus14", "all")
 
 
 def test_pack_hashes_tell_grids_and_splits_apart() -> None:
-    hashes = [scenario_pack_hash(grid_id, split) for grid_id in GRID_IDS for split in SPLITS]
+    hashes = [scenario_pack_hash(grid_id, split) for grid_id in GRID_IDS for split in RECORDED_SPLITS]
     assert len(set(hashes)) == len(hashes)
-    assert hashes == [scenario_pack_hash(grid_id, split) for grid_id in GRID_IDS for split in SPLITS]
+    assert hashes == [scenario_pack_hash(grid_id, split) for grid_id in GRID_IDS for split in RECORDED_SPLITS]
     assert all(len(text) == 16 for text in hashes)
 
 

@@ -106,7 +106,8 @@ class TaskOptions:
     """A preset (``"default"``, ``"paper"``, ``"released"``), the weights of the three default components,
     or a compiled function ``(state, i) -> (survive, overload, cost)``."""
     split: str = "train"
-    """Which scenarios are played: ``"train"``, ``"validation"``, ``"test"`` or ``"bundled"``."""
+    """Which scenarios are played: of the bundled series ``"train"``, ``"validation"``, ``"test"``, or all of them,
+    ``"bundled"``; of generated months ``"generated-train"``, ``"generated-validation"`` or ``"generated-test"``."""
     scenario: str | None = None
     """Play this scenario only."""
     normalize: str | None = "physical"

@@ -37,7 +37,7 @@ from rl2grid.experiments.agents import make_agent
 from rl2grid.experiments.episode import PlayedEpisode
 from rl2grid.experiments.players import Job, Progress, Setting, players
 from rl2grid.mdp.actions import action_set_hash
-from rl2grid.scenarios.library import GENERATOR_VERSION, list_scenarios, scenario_pack_hash
+from rl2grid.scenarios.library import generator_version, list_scenarios, scenario_pack_hash
 from rl2grid.versions import library_versions
 
 PARTIAL_FILE = "episodes.partial.csv"
@@ -233,7 +233,7 @@ def _identity(task: Task, agent: Agent, name: str, keywords: Mapping[str, Any], 
         "constraint": constraint,
         "start": start,
         "grid_hash": task.grid.hash,
-        "generator_version": GENERATOR_VERSION,
+        "generator_version": generator_version(options["split"]),
         "scenario_pack_hash": scenario_pack_hash(task.grid_id, options["split"]),
         "action_set_hash": action_set_hash(task.grid, task.level) if task.kind == "T" else None,
         "versions": library_versions(),

@@ -39,7 +39,8 @@ from rl2grid.envs.registration import register_all
 from rl2grid.envs.tasks import Task, TaskOptions, find_task
 from rl2grid.errors import UsageError, one_of
 from rl2grid.mdp.actions import action_set_hash
-from rl2grid.scenarios.library import GENERATOR_VERSION, scenario_pack_hash
+from rl2grid.scenarios.library import generator_version, scenario_pack_hash
+from rl2grid.scenarios.splits import TRAINING_SPLITS
 from rl2grid.versions import library_versions
 
 CONFIG_FILE = "config.json"
@@ -399,8 +400,9 @@ def _resolved(args: RunArgs) -> RunArgs:
         raise UsageError("A run stores its reward by name: choose a preset or three weights, not a function.")
     # Every keyword is stored, so that the run stays what it is when a default changes.
     keywords = {name: getattr(TaskOptions(**keywords), name) for name in allowed}
-    if keywords["split"] != "train":  # "bundled" holds the test months too
-        raise UsageError(f"Training on the {keywords['split']} scenarios is refused: choose split 'train'.")
+    if keywords["split"] not in TRAINING_SPLITS:  # "bundled" holds the test months too
+        allowed_splits = " or ".join(map(repr, TRAINING_SPLITS))
+        raise UsageError(f"Training on the {keywords['split']} scenarios is refused: choose split {allowed_splits}.")
     if args.evaluate_every < 1:
         raise UsageError(f"evaluate_every must be at least 1 decision, not {args.evaluate_every}.")
     folder = args.folder or Path("runs") / f"{_slug(task)}-{args.algorithm}-{args.hyperparameters.seed}"
@@ -441,7 +443,7 @@ def _identity(args: RunArgs) -> dict[str, Any]:
         "task": task.id,
         "engine": args.env_keywords["engine"],
         "grid_hash": task.grid.hash,
-        "generator_version": GENERATOR_VERSION,
+        "generator_version": generator_version(args.env_keywords["split"]),
         "scenario_pack_hash": scenario_pack_hash(task.grid_id, args.env_keywords["split"]),
         "action_set_hash": action_set_hash(task.grid, task.level) if task.kind == "T" else None,
         "versions": library_versions(),

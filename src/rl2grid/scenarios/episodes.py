@@ -16,16 +16,17 @@ from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
 from rl2grid.scenarios.cache import data_folder
 from rl2grid.scenarios.full import full_data_folder, is_full_requested
-from rl2grid.scenarios.library import list_scenarios, load_scenario
+from rl2grid.scenarios.generated import draw_training_months, maintenance_of
+from rl2grid.scenarios.library import check_in_split, list_scenarios, load_scenario
 from rl2grid.scenarios.maintenance import sample_maintenance
 from rl2grid.scenarios.scenario import Scenario
+from rl2grid.scenarios.splits import GENERATED_TRAINING, TRAINING_SPLITS
 from rl2grid.streams import Purpose, Stream
 
 MAX_STEPS = 8064
 """Steps of a completed episode where the series is that long: four weeks (paper, Section 4)."""
 MIN_TRAINING_STEPS = 288
 """A random start leaves at least this many steps to play, or half the window if that is shorter."""
-_LISTED = 20
 
 
 @dataclass(frozen=True)
@@ -58,26 +59,23 @@ def plan_episode(
 ) -> EpisodePlan:
     """Decide episode ``number`` of the stream of episodes of ``seed``.
 
-    Training (``split="train"``) draws a random row of the split, uniformly among those with enough left
-    to play (:data:`MIN_TRAINING_STEPS`); of the full dataset, whose scenarios have one length, the
-    scenario is drawn uniformly, so that planning does not have to read all of them. The other splits
-    are enumerated: episode ``number`` of seed ``seed`` plays scenario ``seed + number`` of the list
-    (beginning again at its end) from row 0. ``scenario`` and ``start`` replace what would be drawn and
-    leave every other draw as it was.
+    Training draws a random row of the split, uniformly among those with enough left to play
+    (:data:`MIN_TRAINING_STEPS`); of the full dataset, whose scenarios have one length, the scenario is drawn
+    uniformly, so that planning does not have to read all of them; of generated months, a year, a month and a row of
+    it, and the episode goes on in the next month. The other splits are enumerated: episode ``number`` of seed
+    ``seed`` plays scenario ``seed + number`` of the list (beginning again at its end) from row 0. ``scenario`` and
+    ``start`` replace what would be drawn and leave every other draw as it was.
 
     Raises:
         UsageError: ``split`` is unknown, ``scenario`` is not in it, or ``start`` leaves nothing to play.
     """
-    ids = list_scenarios(grid.id, split)
-    if scenario is not None and scenario not in ids:
-        listed = ", ".join(ids[:_LISTED]) + (f" or {len(ids) - _LISTED} more" if len(ids) > _LISTED else "")
-        raise UsageError(f"Scenario {scenario!r} is not in the split {split} of {grid.id}: choose one of {listed}.")
-    training = split == "train"
-    if scenario is None:
-        scenario = _draw_scenario(grid, ids, seed, number) if training else ids[(seed + number) % len(ids)]
+    if scenario is not None:
+        check_in_split(grid.id, split, scenario)
+    else:
+        scenario = _choose_scenario(grid, split, seed, number)
     n_steps = load_scenario(grid.id, scenario).n_steps
     if start is None:
-        start = Stream(seed, number, Purpose.START).integer(admissible_starts(n_steps)) if training else 0
+        start = _draw_start(split, n_steps, seed, number) if split in TRAINING_SPLITS else 0
     _check_start(start, scenario, n_steps)
     return EpisodePlan(seed, number, scenario, int(start), min(MAX_STEPS, n_steps - int(start)), maintenance)
 
@@ -90,8 +88,9 @@ def admissible_starts(n_steps: int) -> int:
 def maintenance_matrix(grid: Grid, scenario: Scenario, plan: EpisodePlan) -> NDArray[np.bool_]:
     """The planned outages of an episode.
 
-    Recorded ones where the scenario records them; else sampled as the grid samples them. A window of a
-    series has the rows that a sample of its whole series has there.
+    Recorded ones where the scenario records them; else sampled as the grid samples them, or, in generated months of
+    a grid that does not, as one of the same lines does. A window of a series has the rows that a sample of its whole
+    series has there.
 
     Returns:
         bool [rows, line] for all rows of ``scenario`` (the episode begins in row ``plan.start``), read-only
@@ -103,8 +102,15 @@ def maintenance_matrix(grid: Grid, scenario: Scenario, plan: EpisodePlan) -> NDA
         return scenario.maintenance
     stream = Stream(plan.seed, plan.number, Purpose.MAINTENANCE)
     start, rows = scenario.series_start_datetime, scenario.series_rows
-    matrix = sample_maintenance(grid.maintenance, start, rows, grid.n_line, stream)
+    matrix = sample_maintenance(maintenance_of(grid, scenario), start, rows, grid.n_line, stream)
     return matrix[scenario.first_row : scenario.first_row + scenario.n_rows]
+
+
+def _choose_scenario(grid: Grid, split: str, seed: int, number: int) -> str:
+    if split == GENERATED_TRAINING:
+        return f"generated/{draw_training_months(seed, number)}"
+    ids = list_scenarios(grid.id, split)
+    return _draw_scenario(grid, ids, seed, number) if split in TRAINING_SPLITS else ids[(seed + number) % len(ids)]
 
 
 def _draw_scenario(grid: Grid, ids: tuple[str, ...], seed: int, number: int) -> str:
@@ -113,6 +119,13 @@ def _draw_scenario(grid: Grid, ids: tuple[str, ...], seed: int, number: int) -> 
         return ids[stream.integer(len(ids))]
     ends = _cumulative_starts(grid, ids, data_folder(), full_data_folder())
     return ids[int(np.searchsorted(ends, stream.integer(int(ends[-1])), side="right"))]
+
+
+def _draw_start(split: str, n_steps: int, seed: int, number: int) -> int:
+    starts = admissible_starts(n_steps)
+    if split == GENERATED_TRAINING:
+        starts = min(starts, MAX_STEPS)  # What follows is there to go on in.
+    return Stream(seed, number, Purpose.START).integer(starts)
 
 
 @functools.lru_cache(maxsize=32)

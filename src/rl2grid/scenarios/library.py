@@ -5,7 +5,9 @@ The source ``bundled`` is inside the Grid2Op wheel. The source ``full`` is Grid2
 dataset where the user has it: ``$RL2GRID_FULL_DATA`` names the folder that holds it (the one with
 ``l2rpn_case14_sandbox`` and its like inside), and its being set is the request to split it instead
 of the bundled series. The split ``bundled`` is every bundled series from beginning to end, in
-either case.
+either case. The source ``generated`` is the generator, of which ``generated-train``,
+``generated-validation`` and ``generated-test`` are splits of their own; the source ``folder`` is
+what the user has imported.
 """
 
 from __future__ import annotations
@@ -21,16 +23,26 @@ from rl2grid.scenarios.bundled import bundled_folders, interconnections, load_bu
 from rl2grid.scenarios.cache import CachedSeries, cached_series, data_folder
 from rl2grid.scenarios.folder import read_folder, source_key
 from rl2grid.scenarios.full import full_data_folder, full_folders, full_split, is_full_requested
+from rl2grid.scenarios.generated import EPISODES_PER_YEAR, VERSION, is_training_seed, load_generated, parse_months
+from rl2grid.scenarios.imported import imported_names, load_imported, store_imported
 from rl2grid.scenarios.scenario import Scenario
-from rl2grid.scenarios.splits import BUNDLED_SPLITS
+from rl2grid.scenarios.splits import (
+    BUNDLED_SPLITS,
+    FIRST_TRAINING_SEED,
+    GENERATED_SPLITS,
+    GENERATED_TRAINING,
+    TRAINING_SEEDS,
+)
 
-SPLITS = ("train", "validation", "test", "bundled")
+RECORDED_SPLITS = ("train", "validation", "test", "bundled")
 """``train`` teaches, ``validation`` picks models, ``test`` has the final word, ``bundled`` is every bundled series."""
 
-SOURCES = ("bundled", "full")
+SPLITS = (*RECORDED_SPLITS, GENERATED_TRAINING, *GENERATED_SPLITS)
+"""All of them; those of generated months have the same purposes."""
 
-GENERATOR_VERSION: str | None = None
-"""Version of what generated the scenarios, named by every result; None: all scenarios are recorded ones."""
+SOURCES = ("bundled", "full", "generated", "folder")
+
+_LISTED = 20
 _ID = re.compile(r"(?P<source>\w+)/(?P<series>[^\[\]]+)(\[(?P<start>\d+):(?P<stop>\d+)\])?")
 
 
@@ -38,11 +50,17 @@ def list_scenarios(grid_id: str, split: str) -> tuple[str, ...]:
     """Ids of the scenarios of a split, in the order in which an evaluation plays them.
 
     Raises:
-        UsageError: Unknown grid or split, or the full dataset is requested and has none.
+        UsageError: Unknown grid or split, the split has no end, or the full dataset is requested and has none.
     """
     grid = load_grid(grid_id)
-    if split not in SPLITS:
-        raise one_of("Split", split, SPLITS)
+    _check_split(split)
+    if split == GENERATED_TRAINING:
+        raise UsageError(
+            f"The split {split} has no end, and its months cannot be listed: choose one of "
+            f"{', '.join(other for other in SPLITS if other != split)}."
+        )
+    if split in GENERATED_SPLITS:
+        return tuple(f"generated/{name}" for name in GENERATED_SPLITS[split])
     if split == "bundled":
         return tuple(f"bundled/{name}" for name in bundled_folders(grid))
     if is_full_requested():
@@ -50,48 +68,116 @@ def list_scenarios(grid_id: str, split: str) -> tuple[str, ...]:
     return tuple(f"bundled/{window}" for window in BUNDLED_SPLITS[grid_id][split])
 
 
+def check_in_split(grid_id: str, split: str, scenario_id: str) -> None:
+    """Refuse a scenario that is not in a split.
+
+    Raises:
+        UsageError: It is not, or unknown grid or split.
+    """
+    _check_split(split)
+    if split == GENERATED_TRAINING:
+        _check_training_months(load_grid(grid_id), scenario_id)
+        return
+    ids = list_scenarios(grid_id, split)
+    if scenario_id not in ids:
+        listed = ", ".join(ids[:_LISTED]) + (f" or {len(ids) - _LISTED} more" if len(ids) > _LISTED else "")
+        raise UsageError(f"Scenario {scenario_id!r} is not in the split {split} of {grid_id}: choose one of {listed}.")
+
+
 def load_scenario(grid_id: str, scenario_id: str) -> Scenario:
-    """The scenario called ``scenario_id``; asking again returns the same object.
+    """The scenario called ``scenario_id``; asking again returns the same object, for a while if it is a generated one.
 
     Raises:
         UsageError: Unknown grid or scenario, or a window outside its series.
     """
-    return _load_scenario(load_grid(grid_id), scenario_id, data_folder(), full_data_folder())
+    grid = load_grid(grid_id)
+    if scenario_id.startswith("generated/"):
+        return _load_generated_scenario(grid, scenario_id, data_folder())
+    return _load_scenario(grid, scenario_id, data_folder(), full_data_folder())
 
 
 def import_folder(grid: Grid, path: Path) -> Scenario:
     """Any Grid2Op scenario folder as a scenario of ``grid``, checked and copied to the data folder.
 
-    Its id is ``folder/<name of the folder>``.
+    Its id is ``folder/<name of the folder>``; an earlier import of that name is replaced.
 
     Raises:
         UsageError: A file, a column or a value is missing or impossible; nothing is imported then.
     """
-    return _scenario(grid, "folder", path.name, _load_folder(grid, "folder", path.name, path))
+    # A folder may be given as `.` or through a link.
+    path = path.resolve()
+    store_imported(grid, path.name, read_folder(grid, path, signed_loads=interconnections(grid)))
+    # The name may have stood for another series before.
+    _load_scenario.cache_clear()
+    _load_series.cache_clear()
+    return load_scenario(grid.id, f"folder/{path.name}")
 
 
 def scenario_pack_hash(grid_id: str, split: str) -> str:
     """Short hash of every value of every scenario of a split.
 
+    Of generated months it begins with the version of the generator, as in ``draft-0123456789abcdef``; of those that
+    training draws it covers the rule by which they are drawn and the first month of the validation split.
+
     Raises:
         UsageError: Unknown grid or split.
     """
     digest = hashlib.sha256()
-    for scenario_id in list_scenarios(grid_id, split):
+    if split == GENERATED_TRAINING:
+        digest.update(f"{FIRST_TRAINING_SEED} {TRAINING_SEEDS} {EPISODES_PER_YEAR}\n".encode())
+        ids = list_scenarios(grid_id, "generated-validation")[:1]
+    else:
+        ids = list_scenarios(grid_id, split)
+    for scenario_id in ids:
         digest.update(f"{scenario_id} {load_scenario(grid_id, scenario_id).content_hash}\n".encode())
-    return digest.hexdigest()[:16]
+    version = generator_version(split)
+    return digest.hexdigest()[:16] if version is None else f"{version}-{digest.hexdigest()[:16]}"
+
+
+def generator_version(split: str) -> str | None:
+    """Version of what generated the scenarios of a split; None: they are recorded ones."""
+    return None if split in RECORDED_SPLITS else VERSION
+
+
+def _check_split(split: str) -> None:
+    if split not in SPLITS:
+        raise one_of("Split", split, SPLITS)
+
+
+def _check_training_months(grid: Grid, scenario_id: str) -> None:
+    source, _, name = scenario_id.partition("/")
+    if source == "generated" and is_training_seed(parse_months(name).seed):
+        return
+    raise UsageError(
+        f"Scenario {scenario_id!r} is not in the split {GENERATED_TRAINING} of {grid.id}: choose one such as "
+        f"generated/{FIRST_TRAINING_SEED}-03, with a seed of at least {FIRST_TRAINING_SEED}."
+    )
 
 
 # The sizes bound the number of open memory maps, each of which keeps a file open.
 @functools.lru_cache(maxsize=128)
 def _load_scenario(grid: Grid, scenario_id: str, data: Path, full_data: Path) -> Scenario:
+    return _find_scenario(grid, scenario_id, data, full_data)
+
+
+# Fewer: there is no end of them, and the space of a removed copy is free again only when nothing maps it.
+@functools.lru_cache(maxsize=16)
+def _load_generated_scenario(grid: Grid, scenario_id: str, data: Path) -> Scenario:
+    return _find_scenario(grid, scenario_id, data, data)
+
+
+def _find_scenario(grid: Grid, scenario_id: str, data: Path, full_data: Path) -> Scenario:
     match = _ID.fullmatch(scenario_id)
     if match is None or match["source"] not in SOURCES:
         raise UsageError(
             f"Scenario {scenario_id!r} is no id: it must look like {list_scenarios(grid.id, 'bundled')[0]}, "
-            f"full/<series>, or a window of one such as {list_scenarios(grid.id, 'bundled')[0]}[0:144]."
+            f"full/<series>, generated/17-03, folder/<name>, or a window of one such as "
+            f"{list_scenarios(grid.id, 'bundled')[0]}[0:144]."
         )
-    whole = _load_series(grid, match["source"], match["series"], data, full_data)
+    if match["source"] == "generated":
+        whole = _scenario(grid, "generated", match["series"], load_generated(grid, match["series"]))
+    else:
+        whole = _load_series(grid, match["source"], match["series"], data, full_data)
     if match["start"] is None:
         return whole
     start, stop = int(match["start"]), int(match["stop"])
@@ -104,6 +190,12 @@ def _load_scenario(grid: Grid, scenario_id: str, data: Path, full_data: Path) ->
 
 @functools.lru_cache(maxsize=128)
 def _load_series(grid: Grid, source: str, name: str, data: Path, full_data: Path) -> Scenario:
+    if source == "folder":
+        if name not in imported_names(grid):
+            raise UsageError(
+                f"Scenario folder/{name} of {grid.id} was not imported: `rl2grid data import {grid.id} FOLDER` does it."
+            )
+        return _scenario(grid, source, name, load_imported(grid, name))
     folders = bundled_folders(grid) if source == "bundled" else full_folders(grid)
     if name not in folders:
         raise one_of(f"Scenario of {grid.id}", f"{source}/{name}", _shortened([f"{source}/{name}" for name in folders]))

@@ -1,6 +1,10 @@
-"""How the bundled series are split for learning and testing.
+"""How the series are split for learning and testing: the bundled ones, and those that the generator makes.
 
-The wheel holds days to months; some grids have a single series. Rows are [first:past the last], 288
+Generated months. A month is named by the seed of its year and its number, ``17-03``. Validation and test are lists of
+20 months, each of another year, in every season; training draws the seeds of its years from a range in which those
+lists have none. Seeds below :data:`FIRST_TRAINING_SEED` that are in no list are free for calibration.
+
+Bundled series. The wheel holds days to months; some grids have a single series. Rows are [first:past the last], 288
 to a day. No row of a test window is in a window of another split, and series with the same demand
 (the two mixes of bus118-M) are cut at the same rows.
 
@@ -71,3 +75,38 @@ BUNDLED_SPLITS: Mapping[str, Mapping[str, tuple[str, ...]]] = MappingProxyType(
     }
 )
 """Windows of the bundled series per grid and split; an id is ``bundled/`` and one of these."""
+
+FIRST_TRAINING_SEED = 1_000_000
+"""Training plays years of this seed and above; validation and test those of seeds below it."""
+
+TRAINING_SEEDS = 2**40
+"""How many seeds training draws from."""
+
+GENERATED_SPLITS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        "generated-validation": (
+            *("500000-00", "500001-07", "500002-02", "500003-09", "500004-04"),
+            *("500005-11", "500006-06", "500007-01", "500008-08", "500009-03"),
+            *("500010-10", "500011-05", "500012-00", "500013-07", "500014-02"),
+            *("500015-09", "500016-04", "500017-11", "500018-06", "500019-01"),
+        ),
+        "generated-test": (
+            *("600000-00", "600001-07", "600002-02", "600003-09", "600004-04"),
+            *("600005-11", "600006-06", "600007-01", "600008-08", "600009-03"),
+            *("600010-10", "600011-05", "600012-00", "600013-07", "600014-02"),
+            *("600015-09", "600016-04", "600017-11", "600018-06", "600019-01"),
+        ),
+    }
+)
+"""Months per split, for every grid; an id is ``generated/`` and one of these."""
+
+GENERATED_TRAINING = "generated-train"
+"""The split of generated months that has no end: its months are drawn."""
+
+TRAINING_SPLITS = ("train", GENERATED_TRAINING)
+"""Splits that may be learned from; their episodes start in a random row."""
+
+VALIDATION_OF: Mapping[str, str] = MappingProxyType({"train": "validation", GENERATED_TRAINING: "generated-validation"})
+"""For each split that may be learned from, the one that picks models."""
+TEST_OF: Mapping[str, str] = MappingProxyType({"train": "test", GENERATED_TRAINING: "generated-test"})
+"""For each split that may be learned from, the one that has the final word."""

@@ -1,0 +1,294 @@
+"""Generated months: how they are named, made when first asked for, and kept.
+
+``17-03`` is month 3 (0 .. 11) of the year of seed 17; ``17-03+04`` is that month and the next one, joined, so that an
+episode that starts late in a month goes on in the next. A month that was made is kept as a small file, its pack, in
+the data folder, and expanded into the memory-mapped copies that all series have. Everything kept can be made again
+from its name: packs are filed under a fingerprint of the generator, so that those of another generator are never
+read; a damaged one is made again; of what training has drawn only the latest is kept.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import multiprocessing
+import re
+import signal
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import fields
+from importlib import resources
+from importlib.resources.abc import Traversable
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import filelock
+import numpy as np
+
+from rl2grid.errors import UsageError
+from rl2grid.grids import Grid, MaintenanceConfig, load_grid
+from rl2grid.scenarios.cache import FORMAT_VERSION, CachedSeries, cached_series, data_folder
+from rl2grid.scenarios.folder import FolderContent
+from rl2grid.scenarios.scenario import Scenario
+from rl2grid.scenarios.splits import FIRST_TRAINING_SEED, TRAINING_SEEDS
+from rl2grid.streams import Purpose, Stream
+
+if TYPE_CHECKING:
+    from rl2grid.scenarios.generator.month import RawMonth
+
+VERSION = "draft"
+"""Version of the generator, named by every result on generated months. As long as it is ``draft``, a name may stand
+for other values after an update; the pack hash, which results name too, tells."""
+
+MONTHS = 12
+EPISODES_PER_YEAR = 12
+"""Training episodes in a row that play the same year: making one month takes as long as making its year."""
+
+EXPANDED_BYTES = 8 * 2**30
+"""Expanded generated months beyond this are removed, oldest first; they are expanded again when needed."""
+TRAINING_PACK_BYTES = 2 * 2**30
+"""Packs of a grid's training years beyond this are removed, oldest first."""
+
+_NAME = re.compile(r"(?P<seed>0|[1-9]\d{0,18})-(?P<month>\d\d)(\+(?P<next>\d\d))?")
+_LOCKS = 64
+
+
+class Months(NamedTuple):
+    """One month, or two in a row, of the year of a seed."""
+
+    seed: int
+    first: int
+    n_months: int
+
+    @property
+    def numbers(self) -> range:
+        """The months, 0 .. 11."""
+        return range(self.first, self.first + self.n_months)
+
+
+def parse_months(name: str) -> Months:
+    """The months that ``name`` stands for.
+
+    Raises:
+        UsageError: It stands for none.
+    """
+    match = _NAME.fullmatch(name)
+    if match is not None:
+        first = int(match["month"])
+        last = first if match["next"] is None else int(match["next"])
+        if last < MONTHS and (match["next"] is None or last == first + 1):
+            return Months(int(match["seed"]), first, last - first + 1)
+    raise UsageError(
+        f"Generated scenario {name!r} does not exist: it must look like 17-03 (seed, and month 00 to 11), or 17-03+04 "
+        "for two months in a row."
+    )
+
+
+def month_name(seed: int, month: int) -> str:
+    """For example ``17-03``."""
+    return f"{seed}-{month:02d}"
+
+
+def draw_training_months(seed: int, number: int) -> str:
+    """Name of the two months in a row in which training episode ``number`` of ``seed`` is played."""
+    year = Stream(seed, number // EPISODES_PER_YEAR, Purpose.SCENARIO).integer(TRAINING_SEEDS)
+    # The second number of the stream: the first may be the one that draws a year.
+    month = int(Stream(seed, number, Purpose.SCENARIO).uniform(2)[1] * (MONTHS - 1))
+    return f"{month_name(FIRST_TRAINING_SEED + year, month)}+{month + 1:02d}"
+
+
+def is_training_seed(seed: int) -> bool:
+    """Whether training may play the year of ``seed``."""
+    return FIRST_TRAINING_SEED <= seed < FIRST_TRAINING_SEED + TRAINING_SEEDS
+
+
+def load_generated(grid: Grid, name: str) -> CachedSeries:
+    """The months called ``name``, from the local copy, their packs or the generator.
+
+    Raises:
+        UsageError: There are no such months, or the data folder cannot be written.
+    """
+    months = parse_months(name)
+    series = cached_series(grid.id, f"generated.{name}", generator_fingerprint(grid), lambda: _content(grid, months))
+    _remove_oldest([*(data_folder() / "series" / f"v{FORMAT_VERSION}").glob("*/generated.*.npy")], EXPANDED_BYTES)
+    return series
+
+
+def maintenance_of(grid: Grid, scenario: Scenario) -> MaintenanceConfig:
+    """How planned outages are sampled where ``scenario`` records none."""
+    if scenario.source != "generated":
+        return grid.maintenance
+    # Imported where it is needed, as in _make.
+    from rl2grid.scenarios.generator.maintenance import generated_maintenance
+
+    return generated_maintenance(grid)
+
+
+@functools.cache
+def generator_fingerprint(grid: Grid) -> str:
+    """Short hash of everything that decides what the generator makes for ``grid``."""
+    package = resources.files("rl2grid")
+    sources = [
+        *_python_files(package / "powerflow"),
+        *_python_files(package / "scenarios" / "generator"),
+        package / "scenarios" / "packs.py",
+        package / "scenarios" / "generator" / "data" / f"{grid.id}.json",
+        package / "streams.py",
+    ]
+    digest = hashlib.sha256(grid.hash.encode())
+    for source in sources:
+        digest.update(source.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def pack_folder(grid: Grid) -> Path:
+    """Where the packs of this generator are kept."""
+    return data_folder() / "packs" / grid.id / generator_fingerprint(grid)
+
+
+def pack_path(grid: Grid, seed: int, month: int) -> Path:
+    """The file that keeps a month, whether it is there or not."""
+    return pack_folder(grid) / f"{month_name(seed, month)}.pack"
+
+
+def make_packs(grid: Grid, months: Iterable[tuple[int, int]], workers: int) -> Iterator[int]:
+    """Make the packs that are not there yet.
+
+    Args:
+        grid: the grid.
+        months: (seed, month 0 .. 11) of each; those of one year are made together.
+        workers: processes; with 1, this one makes them.
+
+    Yields:
+        How many months there are now, of those asked for.
+
+    Raises:
+        UsageError: The data folder cannot be written.
+    """
+    asked = sorted(set(months))
+    missing = [month for month in asked if not pack_path(grid, *month).is_file()]
+    done = len(asked) - len(missing)
+    yield done
+    years = {seed: [month for other, month in missing if other == seed] for seed, _ in missing}
+    if workers == 1 or len(years) <= 1:
+        for seed, month in missing:
+            _read_or_make(grid, seed, [month])
+            done += 1
+            yield done
+        return
+    jobs = [(grid.id, seed, numbers) for seed, numbers in years.items()]
+    context = multiprocessing.get_context("spawn")
+    with context.Pool(min(workers, len(jobs)), initializer=_leave_interrupts_to_the_parent) as pool:
+        for made in pool.imap_unordered(_make_year, jobs):
+            done += made
+            yield done
+
+
+def _leave_interrupts_to_the_parent() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _make_year(job: tuple[str, int, list[int]]) -> int:
+    grid_id, seed, months = job
+    _read_or_make(load_grid(grid_id), seed, months)
+    return len(months)
+
+
+def _content(grid: Grid, months: Months) -> FolderContent:
+    from rl2grid.scenarios.generator import month as generator
+
+    raw = _read_or_make(grid, months.seed, months.numbers)
+    if is_training_seed(months.seed):
+        _remove_oldest(
+            [path for path in pack_folder(grid).glob("*.pack") if is_training_seed(_seed_of(path))],
+            TRAINING_PACK_BYTES,
+        )
+    parts = [generator.arrays_of(grid, each) for each in raw]
+    # In the order of an imported folder, so that hashes agree. The last row of a month is the first of the next one,
+    # which knows the forecasts made in it.
+    joined = {
+        field.name: np.concatenate([*(part[field.name][:-1] for part in parts[:-1]), parts[-1][field.name]])
+        for field in fields(Scenario)
+        if field.name in parts[0]
+    }
+    return FolderContent(generator.start_of(raw[0]), joined)
+
+
+def _read_or_make(grid: Grid, seed: int, months: Sequence[int]) -> list[RawMonth]:
+    """Months of one year, from their packs; those without a sound one are made."""
+    found = [_read(pack_path(grid, seed, month)) for month in months]
+    if None not in found:
+        return [raw for raw in found if raw is not None]
+    folder = pack_folder(grid)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with filelock.FileLock(folder / f"{seed % _LOCKS:02d}.lock"):
+            _make_missing(grid, seed, months)
+            return [_read_back(pack_path(grid, seed, month)) for month in months]
+    except OSError as error:
+        raise UsageError(
+            f"The data folder {data_folder()} cannot be written ({error}): set RL2GRID_DATA to one that can."
+        ) from error
+
+
+def _make_missing(grid: Grid, seed: int, months: Sequence[int]) -> None:
+    for month in months:
+        path = pack_path(grid, seed, month)
+        if _read(path) is None:
+            _make(grid, seed, month)
+    if not is_training_seed(seed):
+        return
+    # The year is at hand, and its other months are likely to be drawn next.
+    for month in range(MONTHS):
+        if not pack_path(grid, seed, month).is_file():
+            _make(grid, seed, month)
+
+
+def _make(grid: Grid, seed: int, month: int) -> None:
+    # Imported where it is needed: compiling takes long, and reading recorded series compiles nothing.
+    from rl2grid.scenarios import packs
+    from rl2grid.scenarios.generator import month as generator
+
+    packs.write_pack(pack_path(grid, seed, month), generator.raw_month(grid, seed, month))
+
+
+def _read(path: Path) -> RawMonth | None:
+    """The month in a pack, or None where there is no sound one."""
+    from rl2grid.scenarios import packs
+
+    try:
+        return packs.read_raw(path)
+    except UsageError:
+        return None
+
+
+def _read_back(path: Path) -> RawMonth:
+    raw = _read(path)
+    if raw is None:
+        raise OSError(f"{path} does not read back as it was written")
+    return raw
+
+
+def _seed_of(path: Path) -> int:
+    return parse_months(path.stem).seed
+
+
+def _remove_oldest(paths: list[Path], limit: int) -> None:
+    """Remove files, the latest excepted, until the rest takes at most ``limit`` bytes."""
+    status = []
+    for path in paths:
+        try:
+            status.append((path.stat().st_mtime_ns, path.stat().st_size, path))
+        except FileNotFoundError:
+            continue  # Another process was faster.
+    excess = sum(size for _, size, _ in status) - limit
+    for _, size, path in sorted(status)[:-1]:
+        if excess <= 0:
+            return
+        # What other processes have mapped stays readable for them.
+        for companion in (path, path.with_suffix(".json"), path.with_suffix(".lock")):
+            companion.unlink(missing_ok=True)
+        excess -= size
+
+
+def _python_files(package: Traversable) -> list[Traversable]:
+    return sorted((file for file in package.iterdir() if file.name.endswith(".py")), key=lambda file: file.name)

@@ -1,0 +1,104 @@
+"""What the AC power flow says of generated injections, in the reference topology and without any protection."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rl2grid.compile import jit
+from rl2grid.grids import Grid
+from rl2grid.powerflow.ac import CONVERGED, FlowState, new_flow_state, run_flow, write_currents, write_flow
+from rl2grid.powerflow.model import Network, load_network
+from rl2grid.scenarios.generator.arithmetic import rounded
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
+I64 = NDArray[np.int64]
+
+
+class Verdict(NamedTuple):
+    """Result of the power flow of several rows."""
+
+    converged: bool
+    """Whether all of them were solved."""
+    losses: I64
+    """[row] 0.1 MW."""
+    slack: F32
+    """[row] production of the slack generator, MW."""
+    loading: F32
+    """[row] largest current over thermal limit."""
+
+
+def assess(grid: Grid, voltage: F32 | None, active: I32, reactive: I32, production: I32) -> Verdict:
+    """Solve the AC power flow of every row; injections in 0.1 MW and 0.1 MVAr, int32 [row, load] and [row, gen].
+
+    Args:
+        grid: one of the seven grids.
+        voltage: set-points, kV, float32 [gen]; None: those of the grid file.
+        active: demand.
+        reactive: reactive demand.
+        production: scheduled production.
+    """
+    network = load_network(grid)
+    setpoint = network.gen_setpoint.astype(np.float32) if voltage is None else voltage / network.gen_kilovolt
+    losses, rows = np.zeros(len(active), np.int64), len(active)
+    slack, loading = np.zeros(rows, np.float32), np.zeros(rows, np.float32)
+    converged = _assess(
+        network,
+        new_flow_state(network, 1),
+        np.ones(grid.dim_topo, np.int32),
+        setpoint.astype(np.float32),
+        np.zeros(grid.n_storage, np.float32),
+        grid.thermal_limit,
+        active,
+        reactive,
+        production,
+        losses,
+        slack,
+        loading,
+    )
+    return Verdict(bool(converged), losses, slack, loading)
+
+
+@jit
+def _assess(
+    network: Network,
+    flow: FlowState,
+    topology: I32,
+    setpoint: F32,
+    storage: F32,
+    limit: F32,
+    active: I32,
+    reactive: I32,
+    production: I32,
+    losses: I64,
+    slack: F32,
+    loading: F32,
+) -> bool:
+    load_p, load_q = np.empty(active.shape[1], np.float32), np.empty(active.shape[1], np.float32)
+    gen_p, solved = np.empty(production.shape[1], np.float32), np.empty(production.shape[1], np.float32)
+    current, line_p = np.empty(limit.size, np.float32), np.empty(limit.size, np.float32)
+    gen_angle, load_angle, storage_angle = np.empty_like(gen_p), np.empty_like(load_p), np.empty_like(storage)
+    balancing = network.slack_gen[0]
+    for row in range(active.shape[0]):
+        balance = 0
+        for load in range(load_p.size):
+            load_p[load] = active[row, load] / 10.0
+            load_q[load] = reactive[row, load] / 10.0
+            balance -= active[row, load]
+        for gen in range(gen_p.size):
+            gen_p[gen] = production[row, gen] / 10.0
+            if gen != balancing:
+                balance += production[row, gen]
+        if run_flow(network, flow, 0, topology, gen_p, setpoint, load_p, load_q, storage) != CONVERGED:
+            return False
+        write_currents(network, flow, 0, current)
+        write_flow(network, flow, 0, line_p, solved, gen_angle, load_angle, storage_angle)
+        slack[row] = solved[balancing]
+        losses[row] = balance + rounded(10.0 * solved[balancing])
+        for line in range(limit.size):
+            loading[row] = max(loading[row], current[line] / limit[line])
+    return True

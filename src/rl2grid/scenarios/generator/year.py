@@ -1,0 +1,204 @@
+"""A year of a grid: demand, wind and sun, dispatch with the losses of the AC power flow, and its repair.
+
+A month must begin secure: no line may be loaded above its limit during its first day, in the reference topology. Where
+one does not, that day, with 6 hours of transition before and after, takes its weather, demand and exchanges from
+another year of the same seed, the first that is secure; after 16 of them each next one is made calmer. A year that
+cannot be repaired so, or whose power flow does not converge in every hour, is discarded.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rl2grid.compile import jit
+from rl2grid.errors import UsageError
+from rl2grid.grids import Grid
+from rl2grid.scenarios.generator.calendar import MONTH_STEPS, MONTHS, ROWS_PER_DAY, ROWS_PER_HOUR, YEAR_ROWS
+from rl2grid.scenarios.generator.constants import Constants, load_constants
+from rl2grid.scenarios.generator.demand import active_demand, new_demand, reactive_demand
+from rl2grid.scenarios.generator.dispatch import Market, dispatch, new_market
+from rl2grid.scenarios.generator.renewables import new_weather, renewable_production
+from rl2grid.scenarios.generator.security import assess
+
+I16 = NDArray[np.int16]
+I32 = NDArray[np.int32]
+I64 = NDArray[np.int64]
+
+MAX_SEED = 2**63 - 1
+LONGEST_HORIZON = ROWS_PER_HOUR
+"""Rows after the year that its last forecasts need."""
+_ROWS = YEAR_ROWS + LONGEST_HORIZON
+_ATTEMPTS = 8
+_SPARE_DAYS = 60
+"""Other years of the seed from which a first day may be taken."""
+_CALM_AFTER, _LESS_DEMAND, _LESS_RENEWABLES = 16, 5, 20
+"""After so many spare days, each has that much less demand, and wind and sun, than the last, in thousandths."""
+_ROUNDS = 12
+_TRANSITION = 6 * ROWS_PER_HOUR
+_SECURE = 0.99
+"""Largest loading of a secure row: other engines may round differently."""
+_PROBED = 0.97
+"""Largest loading of a first day that is dispatched in quarters of an hour, before the real dispatch."""
+_QUARTER = 3
+_DAY_ROWS = ROWS_PER_DAY + 1
+
+
+class Year(NamedTuple):
+    """Series of a year, and 12 rows more; 0.1 MW and 0.1 MVAr."""
+
+    load_p: I16  # [row, load]
+    load_q: I16  # [row, load]
+    prod_p: I16  # [row, gen]
+    attempt: int
+    """Years of this seed that were discarded."""
+    spares: tuple[int, ...]
+    """For each month 0, or the number of the year that its first day was taken from."""
+    short: int
+    """Energy that dispatch could not deliver, 0.1 MW rows."""
+
+
+class _Injections(NamedTuple):
+    load_p: I32
+    load_q: I32
+    prod_p: I32
+
+
+class _Setting(NamedTuple):
+    grid: Grid
+    constants: Constants
+    seed: int
+    attempt: int
+    market: Market
+
+
+@functools.lru_cache(maxsize=2)
+def generate_year(grid: Grid, seed: int) -> Year:
+    """The year of a seed; arrays are read-only.
+
+    Raises:
+        UsageError: ``seed`` is no integer from 0 to 2^63 - 1.
+    """
+    if not isinstance(seed, (int, np.integer)) or isinstance(seed, bool) or not 0 <= seed <= MAX_SEED:
+        raise UsageError(f"Seed {seed!r} is no seed of a year: choose an integer from 0 to {MAX_SEED}.")
+    constants = load_constants(grid.id)
+    for attempt in range(_ATTEMPTS):
+        market = new_market(grid, constants, seed, attempt, _ROWS)
+        year = _attempt_year(_Setting(grid, constants, int(seed), attempt, market))
+        if year is not None:
+            for array in (year.load_p, year.load_q, year.prod_p):
+                array.setflags(write=False)
+            return year
+    raise RuntimeError(f"None of {_ATTEMPTS} years of seed {seed} of {grid.id} can be operated.")
+
+
+def _attempt_year(setting: _Setting) -> Year | None:
+    demand, renewables = _draw(setting, 0, 0, _ROWS)
+    spares = np.zeros(MONTHS, np.int64)
+    doubtful = np.arange(MONTHS)
+    for _ in range(_ROUNDS):
+        for month in doubtful:
+            if not _make_secure(setting, demand, renewables, spares, int(month)):
+                return None
+        series, short = _operate(setting, demand, renewables.copy())
+        if series is None:
+            return None
+        doubtful = np.flatnonzero([not _begins_secure(setting, series, month) for month in range(MONTHS)])
+        if not len(doubtful):
+            load_p, load_q, prod_p = (array.astype(np.int16) for array in series)
+            return Year(load_p, load_q, prod_p, setting.attempt, tuple(spares.tolist()), short)
+        _replace_days(setting, demand, renewables, spares, doubtful)
+    return None
+
+
+def _draw(setting: _Setting, spare: int, first: int, stop: int) -> tuple[I32, I32]:
+    """Demand, wind and sun of a year of the seed; ``spare`` 0 is the one that is being made."""
+    grid, constants, seed = setting.grid, setting.constants, setting.seed
+    number = (setting.attempt << 8) | spare
+    demand = new_demand(grid, constants, seed, number, _ROWS)
+    weather = new_weather(grid, constants.renewables, seed, number, _ROWS)
+    return active_demand(demand, first, stop), renewable_production(weather, first, stop)
+
+
+def _make_secure(setting: _Setting, demand: I32, renewables: I32, spares: I64, month: int) -> bool:
+    """Find the first spare day that is secure for ``month``; whether there is one."""
+    while not _looks_secure(setting, demand, renewables, month):
+        if spares[month] == _SPARE_DAYS:
+            return False
+        _replace_days(setting, demand, renewables, spares, np.array([month]))
+    return True
+
+
+def _looks_secure(setting: _Setting, demand: I32, renewables: I32, month: int) -> bool:
+    """Whether the first day of ``month`` is secure when it is dispatched for itself, every quarter of an hour."""
+    rows = slice(month * MONTH_STEPS, month * MONTH_STEPS + _DAY_ROWS, _QUARTER)
+    load_p, prod_p = demand[rows], renewables[rows].copy()
+    load_q = reactive_demand(setting.constants.demand, load_p)
+    total = load_p.sum(axis=1, dtype=np.int64)
+    dispatch(setting.market, rows.start, _QUARTER, total + _usual_losses(setting, total), prod_p)
+    verdict = assess(setting.grid, setting.constants.voltage, load_p, load_q, prod_p)
+    return verdict.converged and float(verdict.loading.max()) <= _PROBED
+
+
+def _replace_days(setting: _Setting, demand: I32, renewables: I32, spares: I64, months: I64) -> None:
+    """Take the first day of ``months`` from the next spare year."""
+    for month in months:
+        begin = int(month) * MONTH_STEPS
+        first, stop = max(begin - _TRANSITION, 0), begin + _DAY_ROWS + _TRANSITION
+        spares[month] += 1
+        other_demand, other_renewables = _draw(setting, int(spares[month]), first, stop)
+        calm = max(int(spares[month]) - _CALM_AFTER, 0)
+        other_demand = other_demand * (1000 - _LESS_DEMAND * calm) // 1000
+        other_renewables = other_renewables * (1000 - _LESS_RENEWABLES * calm) // 1000
+        _fade(demand[first:stop], other_demand, begin - first)
+        _fade(renewables[first:stop], other_renewables, begin - first)
+
+
+@jit
+def _fade(series: I32, other: I32, begin: int) -> None:
+    """Blend ``other`` into ``series``: entirely in the day that starts at row ``begin``, less before and after."""
+    for row in range(series.shape[0]):
+        outside = max(begin - row, row - begin - (_DAY_ROWS - 1), 0)
+        weight = max(_TRANSITION - outside, 0)
+        for k in range(series.shape[1]):
+            mixed = series[row, k] * (_TRANSITION - weight) + other[row, k] * weight
+            series[row, k] = (mixed + _TRANSITION // 2) // _TRANSITION
+
+
+def _operate(setting: _Setting, load_p: I32, prod_p: I32) -> tuple[_Injections | None, int]:
+    """Dispatch a year into ``prod_p``, first by the hour to learn its losses; None where a flow does not converge."""
+    load_q = reactive_demand(setting.constants.demand, load_p)
+    total = load_p.sum(axis=1, dtype=np.int64)
+    hours = slice(None, None, ROWS_PER_HOUR)
+    hourly = prod_p[hours].copy()
+    dispatch(setting.market, 0, ROWS_PER_HOUR, total[hours] + _usual_losses(setting, total[hours]), hourly)
+    verdict = assess(setting.grid, setting.constants.voltage, load_p[hours], load_q[hours], hourly)
+    if not verdict.converged:
+        return None, 0
+    short = dispatch(setting.market, 0, 1, total + _every_row(verdict.losses, len(total)), prod_p)
+    return _Injections(load_p, load_q, prod_p), int(short)
+
+
+def _usual_losses(setting: _Setting, total: I64) -> I64:
+    losses: I64 = np.floor(total * setting.constants.supply.losses[0]).astype(np.int64)
+    return losses
+
+
+def _begins_secure(setting: _Setting, series: _Injections, month: int) -> bool:
+    day = slice(month * MONTH_STEPS, month * MONTH_STEPS + _DAY_ROWS)
+    verdict = assess(setting.grid, setting.constants.voltage, *(array[day] for array in series))
+    return verdict.converged and float(verdict.loading.max()) <= _SECURE
+
+
+@jit
+def _every_row(hourly: I64, rows: int) -> I64:
+    """Straight lines between the hours, level after the last."""
+    result = np.empty(rows, np.int64)
+    for row in range(rows):
+        hour, part = row // ROWS_PER_HOUR, row % ROWS_PER_HOUR
+        after = min(hour + 1, hourly.size - 1)
+        result[row] = (hourly[hour] * (ROWS_PER_HOUR - part) + hourly[after] * part) // ROWS_PER_HOUR
+    return result

@@ -1,0 +1,280 @@
+"""Generated months: named, made once, kept, repaired, and never trained on where they are held out."""
+
+import shutil
+import threading
+from dataclasses import replace
+from datetime import timedelta
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+
+import rl2grid  # noqa: F401  (registers the tasks)
+from rl2grid.errors import UsageError
+from rl2grid.grids import GRID_IDS, load_grid
+from rl2grid.scenarios import generated, library
+from rl2grid.scenarios.cache import data_folder
+from rl2grid.scenarios.episodes import MAX_STEPS, EpisodePlan, maintenance_matrix, plan_episode
+from rl2grid.scenarios.generator import month as generator
+from rl2grid.scenarios.library import list_scenarios, load_scenario, scenario_pack_hash
+from rl2grid.scenarios.splits import FIRST_TRAINING_SEED, GENERATED_SPLITS, GENERATED_TRAINING, TRAINING_SEEDS
+
+BUS14 = load_grid("bus14")
+MONTH_STEPS = 8064
+
+
+@pytest.fixture
+def made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
+    """An empty data folder, and the months that the generator was asked for since."""
+    monkeypatch.setenv("RL2GRID_DATA", str(tmp_path))
+    months: list[tuple[int, int]] = []
+    generate = generator.raw_month
+
+    def counted(grid, seed, month):
+        months.append((seed, month))
+        return generate(grid, seed, month)
+
+    monkeypatch.setattr(generator, "raw_month", counted)
+    return months
+
+
+def forget_expanded() -> None:
+    shutil.rmtree(data_folder() / "series")
+    library._load_generated_scenario.cache_clear()
+
+
+def test_a_month_is_what_the_generator_makes(made) -> None:
+    scenario, expected = load_scenario("bus14", "generated/17-03"), generator.generate_month(BUS14, 17, 3)
+    assert (scenario.id, scenario.source, scenario.grid_id) == ("generated/17-03", "generated", "bus14")
+    assert scenario.start_datetime == expected.start_datetime
+    assert scenario.n_steps == MONTH_STEPS
+    assert scenario.arrays().keys() == expected.arrays().keys()
+    for name, array in expected.arrays().items():
+        np.testing.assert_array_equal(getattr(scenario, name), array)
+        assert not getattr(scenario, name).flags.writeable
+    assert load_scenario("bus14", "generated/17-03") is scenario
+
+
+def test_two_months_in_a_row_are_joined(made) -> None:
+    both = load_scenario("bus14", "generated/17-03+04")
+    first, second = (load_scenario("bus14", f"generated/17-{month}") for month in ("03", "04"))
+    assert both.n_steps == 2 * MONTH_STEPS
+    assert both.start_datetime == first.start_datetime
+    assert second.start_datetime - first.start_datetime == timedelta(minutes=5 * MONTH_STEPS)
+    for name, array in both.arrays().items():
+        np.testing.assert_array_equal(array[:MONTH_STEPS], getattr(first, name)[:-1])
+        np.testing.assert_array_equal(array[MONTH_STEPS:], getattr(second, name))
+    for name in ("load_p", "load_q", "prod_p"):
+        np.testing.assert_array_equal(getattr(first, name)[-1], getattr(second, name)[0])
+    window = load_scenario("bus14", "generated/17-03+04[8000:8200]")
+    np.testing.assert_array_equal(window.load_p, both.load_p[8000:8200])
+
+
+def test_a_pack_spares_the_generator_and_a_damaged_one_is_made_again(made) -> None:
+    before = load_scenario("bus14", "generated/17-03").content_hash
+    forget_expanded()
+    assert load_scenario("bus14", "generated/17-03").content_hash == before
+    assert made == [(17, 3)]
+    pack = generated.pack_path(BUS14, 17, 3)
+    for damage in (lambda raw: raw[: len(raw) // 2], lambda raw: raw[:-40] + bytes(20) + raw[-20:], lambda raw: b""):
+        made.clear()
+        pack.write_bytes(damage(pack.read_bytes()))
+        forget_expanded()
+        assert load_scenario("bus14", "generated/17-03").content_hash == before
+        assert made == [(17, 3)]
+
+
+def test_a_month_is_made_once_by_several_makers(made) -> None:
+    hashes: list[str] = []
+    makers = [
+        threading.Thread(target=lambda: hashes.append(generated.load_generated(BUS14, "17-05").content_hash))
+        for _ in range(4)
+    ]
+    for maker in makers:
+        maker.start()
+    for maker in makers:
+        maker.join()
+    assert made == [(17, 5)]
+    assert len(hashes) == 4
+    assert len(set(hashes)) == 1
+
+
+def test_packs_of_another_generator_are_not_read(made, monkeypatch) -> None:
+    load_scenario("bus14", "generated/17-03")
+    monkeypatch.setattr(generated, "generator_fingerprint", lambda grid: "another")
+    library._load_generated_scenario.cache_clear()
+    load_scenario("bus14", "generated/17-03")
+    assert made == [(17, 3), (17, 3)]
+
+
+def test_making_skips_what_is_there(made) -> None:
+    assert list(generated.make_packs(BUS14, [(3, 1), (3, 0)], workers=1)) == [0, 1, 2]
+    assert list(generated.make_packs(BUS14, [(3, 0), (3, 1), (3, 2)], workers=1)) == [2, 3]
+    assert made == [(3, 0), (3, 1), (3, 2)]
+
+
+@pytest.mark.slow
+def test_processes_make_the_same_packs(made) -> None:
+    months = [(3, 0), (3, 1), (4, 0)]
+    assert list(generated.make_packs(BUS14, months, workers=2))[-1] == 3
+    packs = [generated.pack_path(BUS14, *month).read_bytes() for month in months]
+    shutil.rmtree(generated.pack_folder(BUS14))
+    list(generated.make_packs(BUS14, months, workers=1))
+    assert packs == [generated.pack_path(BUS14, *month).read_bytes() for month in months]
+
+
+def test_only_the_latest_expanded_months_are_kept_and_mapped_ones_stay_readable(made, monkeypatch) -> None:
+    monkeypatch.setattr(generated, "EXPANDED_BYTES", 1)
+    first = load_scenario("bus14", "generated/17-03")
+    total = first.load_p.sum()
+    load_scenario("bus14", "generated/17-04")
+    kept = [path.name for path in (data_folder() / "series").rglob("*") if path.is_file()]
+    assert sorted(name.rpartition(".")[2] for name in kept) == ["json", "lock", "npy"]
+    assert all(name.startswith("generated.17-04-") for name in kept)
+    assert first.load_p.sum() == total
+
+
+def test_training_keeps_whole_years_and_forgets_the_oldest(made, monkeypatch) -> None:
+    old, new = FIRST_TRAINING_SEED + 1, FIRST_TRAINING_SEED + 2
+    load_scenario("bus14", "generated/17-03")
+    load_scenario("bus14", f"generated/{old}-03+04")
+    assert sorted(made[1:]) == [(old, month) for month in range(12)]
+    monkeypatch.setattr(generated, "TRAINING_PACK_BYTES", 1)
+    load_scenario("bus14", f"generated/{new}-03+04")
+    kept = [path.stem for path in generated.pack_folder(BUS14).glob("*.pack")]
+    assert len(kept) == 2
+    assert "17-03" in kept
+    assert any(name.startswith(str(new)) for name in kept)
+
+
+@pytest.mark.parametrize(
+    "name", ["7", "17-12", "17-3", "17-03+05", "17-11+12", "-1-03", "017-03", "1e3-03", f"{10**19}-03", "17-03+"]
+)
+def test_names_of_nothing_are_refused(name: str) -> None:
+    with pytest.raises(UsageError, match="must look like 17-03"):
+        load_scenario("bus14", f"generated/{name}")
+
+
+def test_held_out_months_are_of_other_years_in_all_seasons() -> None:
+    months = {split: [generated.parse_months(name) for name in names] for split, names in GENERATED_SPLITS.items()}
+    assert months.keys() == {"generated-validation", "generated-test"}
+    seeds = [each.seed for split in months.values() for each in split]
+    assert len(set(seeds)) == len(seeds) == 40
+    assert max(seeds) < FIRST_TRAINING_SEED
+    for split in months.values():
+        assert {each.first for each in split} == set(range(12))
+        per_season = np.bincount([each.first // 3 for each in split], minlength=4)
+        assert per_season.min() >= 4
+        assert all(each.n_months == 1 for each in split)
+
+
+def test_training_never_draws_a_held_out_month() -> None:
+    drawn = [
+        generated.parse_months(generated.draw_training_months(seed, number))
+        for seed in range(500)
+        for number in range(40)
+    ]
+    held_out = {generated.parse_months(name).seed for names in GENERATED_SPLITS.values() for name in names}
+    assert not held_out & {each.seed for each in drawn}
+    assert all(generated.is_training_seed(each.seed) for each in drawn)
+    assert not any(generated.is_training_seed(seed) for seed in held_out)
+    assert FIRST_TRAINING_SEED + TRAINING_SEEDS <= 2**63
+    # Also by construction: no draw of the stream reaches a seed below the range.
+    assert generated.is_training_seed(FIRST_TRAINING_SEED)
+    assert not generated.is_training_seed(FIRST_TRAINING_SEED - 1)
+    counts = np.bincount([each.first for each in drawn], minlength=12)
+    assert counts[11] == 0
+    np.testing.assert_allclose(counts[:11] / len(drawn), 1 / 11, atol=0.01)
+
+
+def test_twelve_episodes_in_a_row_are_of_one_year() -> None:
+    seeds = [generated.parse_months(generated.draw_training_months(5, number)).seed for number in range(36)]
+    assert [len(set(seeds[first : first + 12])) for first in (0, 12, 24)] == [1, 1, 1]
+    assert len(set(seeds)) == 3
+    assert generated.draw_training_months(6, 0) != generated.draw_training_months(5, 0)
+
+
+def test_training_plans_start_anywhere_and_go_on_in_the_next_month(made) -> None:
+    plans = [plan_episode(BUS14, GENERATED_TRAINING, 5, number) for number in range(12)]
+    assert plans == [plan_episode(BUS14, GENERATED_TRAINING, 5, number) for number in range(12)]
+    assert all(plan.n_steps == MAX_STEPS and 0 <= plan.start < MONTH_STEPS for plan in plans)
+    starts = [plan.start for plan in plans]
+    assert len(set(starts)) == 12
+    assert max(starts) > MONTH_STEPS / 2 > min(starts)
+    chosen = plan_episode(BUS14, GENERATED_TRAINING, 5, 0, start=7)
+    assert (chosen.scenario_id, chosen.start) == (plans[0].scenario_id, 7)
+    scenario = load_scenario("bus14", plans[0].scenario_id)
+    assert maintenance_matrix(BUS14, scenario, plans[0]).shape == (2 * MONTH_STEPS + 1, BUS14.n_line)
+
+
+def test_generated_months_have_outages_on_grids_whose_series_record_them() -> None:
+    grid = load_grid("bus36-MO-v0")
+    recorded = load_scenario(grid.id, "bundled/Scenario_august_dummy")
+    scenario = replace(recorded, source="generated", maintenance=None)
+    plans = [EpisodePlan(0, number, "generated/0-07", 0, scenario.n_steps) for number in range(40)]
+    lines = np.any([maintenance_matrix(grid, scenario, plan).any(axis=0) for plan in plans], axis=0)
+    assert set(np.flatnonzero(lines)) <= set(load_grid("bus36-M").maintenance.lines)
+    assert lines.any()
+
+
+def test_held_out_plans_enumerate_whole_months(made) -> None:
+    for split, names in GENERATED_SPLITS.items():
+        plan = plan_episode(BUS14, split, 0, 1)
+        assert (plan.scenario_id, plan.start, plan.n_steps) == (f"generated/{names[1]}", 0, MAX_STEPS)
+
+
+@pytest.mark.parametrize("split", GENERATED_SPLITS)
+def test_held_out_months_are_refused_in_training(split: str) -> None:
+    for name in GENERATED_SPLITS[split]:
+        with pytest.raises(
+            UsageError, match="not in the split generated-train of bus14: choose one such as generated/"
+        ):
+            plan_episode(BUS14, GENERATED_TRAINING, 0, 0, scenario=f"generated/{name}")
+    with pytest.raises(UsageError, match="not in the split"):
+        plan_episode(BUS14, split, 0, 0, scenario=f"generated/{FIRST_TRAINING_SEED}-03")
+    with pytest.raises(UsageError, match="not in the split generated-train"):
+        plan_episode(BUS14, GENERATED_TRAINING, 0, 0, scenario="bundled/0000")
+
+
+@pytest.mark.parametrize("grid_id", GRID_IDS)
+def test_splits_of_generated_months_are_listed_where_they_end(grid_id: str) -> None:
+    for split, names in GENERATED_SPLITS.items():
+        assert list_scenarios(grid_id, split) == tuple(f"generated/{name}" for name in names)
+    with pytest.raises(UsageError, match="has no end, and its months cannot be listed: choose one of train, "):
+        list_scenarios(grid_id, GENERATED_TRAINING)
+
+
+def test_results_name_the_generator(made, monkeypatch) -> None:
+    few = {split: names[:2] for split, names in GENERATED_SPLITS.items()}
+    monkeypatch.setattr(library, "GENERATED_SPLITS", few)
+    hashes = [scenario_pack_hash("bus14", split) for split in (*few, GENERATED_TRAINING)]
+    assert hashes == [scenario_pack_hash("bus14", split) for split in (*few, GENERATED_TRAINING)]
+    assert len(set(hashes)) == 3
+    for text in hashes:
+        version, _, digest = text.rpartition("-")
+        assert version == generated.VERSION
+        assert len(digest) == 16
+    assert [library.generator_version(split) for split in library.RECORDED_SPLITS] == [None] * 4
+    assert {library.generator_version(split) for split in (*few, GENERATED_TRAINING)} == {generated.VERSION}
+
+
+def test_an_unwritable_data_folder_is_named(tmp_path: Path, monkeypatch) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("RL2GRID_DATA", str(tmp_path / "file"))
+    with pytest.raises(UsageError, match="set RL2GRID_DATA to one that can"):
+        load_scenario("bus14", "generated/17-03")
+
+
+def test_both_engines_play_the_same_month(made) -> None:
+    played = {}
+    for engine in ("native", "reference"):
+        env = gymnasium.make(
+            "rl2grid/bus14-T0-v0", engine=engine, split="generated-validation", heuristic=None, opponent=False
+        )
+        observations = [env.reset(seed=0)[0]] + [env.step(0)[0] for _ in range(30)]
+        played[engine] = np.array(observations)
+        env.close()
+    assert made == [generated.parse_months(GENERATED_SPLITS["generated-validation"][0])[:2]]
+    np.testing.assert_allclose(played["native"], played["reference"], rtol=1e-4, atol=1e-4)
+    assert np.ptp(played["native"], axis=0).any()
