@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from rl2grid import __version__
+from rl2grid.cli import data
 from rl2grid.cli.train import INTERRUPTED, train
 from rl2grid.engines import ENGINES, HEURISTICS
 from rl2grid.errors import UsageError
@@ -54,6 +55,7 @@ def _run(command_line: list[str]) -> int:
     commands.add_parser("train", help="train an algorithm on a task", add_help=False)
     _add_evaluate(commands)
     _add_rank(commands)
+    data.add_parser(commands)
     if command_line[:1] == ["train"]:
         return train(command_line[1:])
     options = parser.parse_args(command_line)

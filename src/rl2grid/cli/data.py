@@ -1,0 +1,247 @@
+"""``rl2grid data``: what series there are, making, importing, exporting, checking and downloading them."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.filesize import decimal
+from rich.progress import (
+    BarColumn,
+    DownloadColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    TextColumn,
+    TimeRemainingColumn,
+    TransferSpeedColumn,
+)
+from rich.table import Table
+
+from rl2grid.errors import UsageError
+from rl2grid.grids import GRID_IDS, load_grid
+from rl2grid.scenarios import generated, holdings
+from rl2grid.scenarios.cache import data_folder
+from rl2grid.scenarios.download import download_dataset, find_archive
+from rl2grid.scenarios.export import export_scenario
+from rl2grid.scenarios.full import VARIABLE, full_data_folder
+from rl2grid.scenarios.library import import_folder, load_scenario
+from rl2grid.scenarios.splits import GENERATED_SPLITS
+
+ALL_MONTHS = "0-11"
+
+
+def add_parser(commands: Any) -> None:
+    """Add the subcommand to those of ``rl2grid``."""
+    parser = commands.add_parser("data", help="list, make, import, export, check, clean and download scenarios")
+    parser.set_defaults(run=lambda options: _print_help(parser))
+    actions = parser.add_subparsers(dest="action", metavar="action")
+    _add_list(actions)
+    _add_make(actions)
+    _add_import(actions)
+    _add_export(actions)
+    _add_check(actions)
+    _add_clean(actions)
+    _add_download(actions)
+
+
+def _print_help(parser: argparse.ArgumentParser) -> int:
+    parser.print_help()
+    return 0
+
+
+def _add_list(actions: Any) -> None:
+    parser = actions.add_parser("list", help="what there is, and how much space it takes")
+    parser.add_argument("grid", nargs="?", default=None, help="only this grid")
+    parser.set_defaults(run=_list)
+
+
+def _list(options: argparse.Namespace) -> int:
+    grids = [load_grid(grid_id) for grid_id in (GRID_IDS if options.grid is None else (options.grid,))]
+    table = Table(title="Scenarios on this machine", title_justify="left")
+    for name in ("grid", "source", "what"):
+        table.add_column(name, no_wrap=name != "what")
+    table.add_column("size", justify="right", no_wrap=True)
+    table.add_column("where", overflow="fold")
+    for grid in grids:
+        for holding in holdings.holdings(grid):
+            table.add_row(grid.id, holding.kind, holding.what, decimal(holding.size), str(holding.place))
+    _console().print(table)
+    print(f"Caches in {data_folder()} take {decimal(holdings.caches_size())}; `rl2grid data clean` removes them.")
+    return 0
+
+
+def _add_make(actions: Any) -> None:
+    parser = actions.add_parser("make", help="make generated months before they are needed")
+    parser.add_argument("grid", help="for example bus14")
+    wanted = parser.add_mutually_exclusive_group(required=True)
+    wanted.add_argument("--seed", type=int, default=None, help="seed of the year")
+    wanted.add_argument("--split", default=None, choices=tuple(GENERATED_SPLITS), help="all months of a split")
+    parser.add_argument("--months", default=None, help=f"months of the year, as 0-11 or 0,3,6 (default {ALL_MONTHS})")
+    parser.add_argument("--workers", type=int, default=None, help="processes; by default one per core")
+    parser.set_defaults(run=_make)
+
+
+def _make(options: argparse.Namespace) -> int:
+    grid = load_grid(options.grid)
+    workers = _workers(options.workers)
+    months = _wanted_months(options)
+    with _progress(MofNCompleteColumn(), _Rate(), TimeRemainingColumn()) as bar:
+        task = bar.add_task(f"Making months of {grid.id}", total=len(months))
+        for done in generated.make_packs(grid, months, workers):
+            bar.update(task, completed=done)
+    print(f"{len(months)} months of {grid.id} are in {generated.pack_folder(grid)}.")
+    return 0
+
+
+def _wanted_months(options: argparse.Namespace) -> list[tuple[int, int]]:
+    if options.split is None:
+        if not 0 <= options.seed < 2**63:
+            raise UsageError(f"Seed {options.seed} is no seed of a year: choose an integer from 0 to 2^63 - 1.")
+        return [(options.seed, month) for month in _month_numbers(options.months or ALL_MONTHS)]
+    if options.months is not None:
+        raise UsageError(f"Split {options.split} says which months are made: leave --months out, or give --seed.")
+    months = [generated.parse_months(name) for name in GENERATED_SPLITS[options.split]]
+    return [(each.seed, each.first) for each in months]
+
+
+def _month_numbers(text: str) -> list[int]:
+    numbers: set[int] = set()
+    try:
+        for part in text.split(","):
+            first, _, last = part.partition("-")
+            numbers |= set(range(int(first), int(last or first) + 1))
+    except ValueError:
+        numbers = set()
+    if not numbers or not numbers <= set(range(generated.MONTHS)):
+        raise UsageError(f"Months {text!r} do not exist: give numbers from 0 to 11, as 0-11 or 0,3,6.")
+    return sorted(numbers)
+
+
+def _workers(asked: int | None) -> int:
+    if asked is None:
+        return len(os.sched_getaffinity(0))
+    if asked < 1:
+        raise UsageError(f"--workers {asked} is not allowed: at least 1 process is needed.")
+    return asked
+
+
+def _add_import(actions: Any) -> None:
+    parser = actions.add_parser("import", help="check and keep a Grid2Op scenario folder")
+    parser.add_argument("grid", help="for example bus14")
+    parser.add_argument("folder", type=Path, help="a folder with load_p.csv or load_p.csv.bz2 and its companions")
+    parser.set_defaults(run=_import)
+
+
+def _import(options: argparse.Namespace) -> int:
+    scenario = import_folder(load_grid(options.grid), options.folder)
+    print(f"Imported {scenario.id}: {scenario.n_rows:,} rows from {scenario.start_datetime:%Y-%m-%d %H:%M}.")
+    return 0
+
+
+def _add_export(actions: Any) -> None:
+    parser = actions.add_parser("export", help="write a scenario as a folder that Grid2Op plays")
+    parser.add_argument("grid", help="for example bus14")
+    parser.add_argument("scenario", help="for example generated/17-03 or bundled/0000")
+    parser.add_argument("folder", type=Path, help="folder to be made")
+    parser.set_defaults(run=_export)
+
+
+def _export(options: argparse.Namespace) -> int:
+    grid = load_grid(options.grid)
+    scenario = load_scenario(grid.id, options.scenario)
+    folder = export_scenario(grid, scenario, options.folder)
+    print(f"Wrote {scenario.n_rows:,} rows of {scenario.id} to {folder} ({decimal(holdings.size_of(folder))}).")
+    return 0
+
+
+def _add_check(actions: Any) -> None:
+    parser = actions.add_parser("check", help="compare generated with bundled series on a page with plots")
+    parser.add_argument("grid", help="for example bus14")
+    parser.add_argument("--years", type=int, default=2, help="generated years to compare, with seeds 0, 1, ...")
+    parser.add_argument("--output", type=Path, default=None, help="page; by default reports/scenarios-<grid>.html")
+    parser.set_defaults(run=_check)
+
+
+def _check(options: argparse.Namespace) -> int:
+    grid = load_grid(options.grid)
+    if options.years < 1:
+        raise UsageError(f"--years {options.years} is not allowed: at least 1 is needed.")
+    try:
+        from rl2grid.analysis import scenario_check
+    except ImportError as error:
+        raise UsageError(f"The page needs {error.name}: install it with `pip install rl2grid[analysis]`.") from None
+    output = options.output or Path("reports") / f"scenarios-{grid.id}.html"
+    wanted = scenario_check.wanted_scenarios(grid, options.years)
+    samples = []
+    with _progress(MofNCompleteColumn(), TimeRemainingColumn()) as bar:
+        for scenario_id in bar.track(wanted, description=f"Reading series of {grid.id}"):
+            samples.append(scenario_check.measure(grid, load_scenario(grid.id, scenario_id)))
+    comparison = scenario_check.compare(grid, samples)
+    scenario_check.write_page(comparison, output)
+    _console().print(scenario_check.rich_table(comparison))
+    print(f"Page written to {output}.")
+    return 0
+
+
+def _add_clean(actions: Any) -> None:
+    parser = actions.add_parser("clean", help="remove what can be made again")
+    parser.add_argument("--yes", action="store_true", help="do not ask")
+    parser.set_defaults(run=_clean)
+
+
+def _clean(options: argparse.Namespace) -> int:
+    size = decimal(holdings.caches_size())
+    where = f"expanded copies and generated months in {data_folder()}"
+    if not options.yes:
+        if not sys.stdin.isatty():
+            raise UsageError(f"The {where} ({size}) were left alone, since nobody can be asked: add --yes.")
+        if input(f"Remove the {where} ({size})? They are made again when needed. [y/N] ").strip().lower() != "y":
+            print("Nothing was removed.")
+            return 0
+    holdings.remove_caches()
+    print(f"Removed the {where}: {size}.")
+    return 0
+
+
+def _add_download(actions: Any) -> None:
+    parser = actions.add_parser("download", help="fetch the full dataset of a grid from where Grid2Op offers it")
+    parser.add_argument("grid", help="for example bus14")
+    parser.add_argument("--folder", type=Path, default=None, help="where datasets are kept; by default ~/data_grid2op")
+    parser.set_defaults(run=_download)
+
+
+def _download(options: argparse.Namespace) -> int:
+    grid = load_grid(options.grid)
+    folder: Path = options.folder or full_data_folder()
+    archive = find_archive(grid.grid2op_name)
+    with _progress(DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn()) as bar:
+        task = bar.add_task(f"Downloading {grid.grid2op_name}", total=None)
+        target = download_dataset(
+            grid, folder, archive, lambda present, total: bar.update(task, completed=present, total=total)
+        )
+    print(f"Dataset of {grid.id} in {target}. To play it: export {VARIABLE}={folder}")
+    return 0
+
+
+class _Rate(ProgressColumn):
+    """Months per minute."""
+
+    def render(self, task: Any) -> str:
+        return "" if task.speed is None else f"{60 * task.speed:.1f}/min"
+
+
+def _progress(*columns: ProgressColumn) -> Progress:
+    shown: Sequence[ProgressColumn] = (TextColumn("{task.description}"), BarColumn(), *columns)
+    return Progress(*shown, console=Console(stderr=True))
+
+
+def _console() -> Console:
+    console = Console()
+    # A table cut to the width of a pipe would lose columns.
+    return Console(width=console.width if console.is_terminal else 160)
