@@ -18,6 +18,7 @@ from rl2grid.engines.native.entry import (
     finish_simulation_one,
     lose_one,
     reset_one,
+    set_generators_one,
     step_one,
 )
 from rl2grid.engines.native.memory import LOAD_P, LOAD_Q, PROD_P, PROD_V, Memory, new_memory
@@ -25,7 +26,7 @@ from rl2grid.engines.native.series import outages_of
 from rl2grid.engines.native.tables import Arrays, addresses_of, new_arrays
 from rl2grid.errors import UsageError, one_of
 from rl2grid.grids import Grid
-from rl2grid.mdp.actions import ActionKind, StepAction
+from rl2grid.mdp.actions import DO_NOTHING, ActionKind, StepAction
 from rl2grid.mdp.opponents import OpponentDraws, draw_opponent, load_draws
 from rl2grid.mdp.state import F32, GridState
 from rl2grid.mdp.termination import GameOver
@@ -139,18 +140,24 @@ class NativeEngine:
 
     def simulate(self, i: int, action: StepAction, horizon: int) -> GridState:
         """One step on the forecast; what it does is described in ``docs/simulate.md``."""
-        scenario = self._scenarios[i]
-        if self.state.terminated[i] or scenario is None:
-            raise UsageError("Nothing can be simulated after a game over: reset the environment first.")
-        if scenario.load_p_forecast is None or horizon > scenario.load_p_forecast.shape[1]:
-            raise UsageError(f"Scenario {scenario.id!r} has no forecast {horizon} steps ahead.")
-        result, addresses = self._simulated, self._simulated_addresses
-        self._copy_row(i)
-        exact = self.dispatch == "exact"
-        needed = begin_simulation_one(addresses, self.addresses, i, *_command(action), horizon, exact)
-        if not needed or self._find_simulated_dispatch():
-            finish_simulation_one(addresses)
-        return result.state
+        if self._begin_simulation(i, action, horizon):
+            finish_simulation_one(self._simulated_addresses)
+        return self._simulated.state
+
+    def foresee(self, i: int, horizon: int) -> Arrays | None:
+        """What :meth:`simulate` hands to the power flow when nobody acts.
+
+        Returns:
+            Arrays whose row 0 holds topology, cooldowns and injections, until the next call or simulation; None if
+            the generators cannot follow the forecast.
+
+        Raises:
+            UsageError: after a game over, or without such a forecast.
+        """
+        if not self._begin_simulation(i, DO_NOTHING, horizon):
+            return None
+        set_generators_one(self._simulated_addresses, 0)
+        return self._simulated
 
     def close(self) -> None:
         """Let go of the series."""
@@ -173,6 +180,18 @@ class NativeEngine:
             getattr(larger, name)[:, :room] = getattr(memory, name)
         grown = {name: getattr(larger, name) for name in ("outage_line", "outage_begin", "outage_end")}
         self._use(replace(self.arrays, memory=memory._replace(**grown)))
+
+    def _begin_simulation(self, i: int, action: StepAction, horizon: int) -> bool:
+        """Play a step on the forecast up to the setting of the generators; False if they cannot be dispatched."""
+        scenario = self._scenarios[i]
+        if self.state.terminated[i] or scenario is None:
+            raise UsageError("Nothing can be simulated after a game over: reset the environment first.")
+        if scenario.load_p_forecast is None or horizon > scenario.load_p_forecast.shape[1]:
+            raise UsageError(f"Scenario {scenario.id!r} has no forecast {horizon} steps ahead.")
+        self._copy_row(i)
+        exact, addresses = self.dispatch == "exact", self._simulated_addresses
+        needed = begin_simulation_one(addresses, self.addresses, i, *_command(action), horizon, exact)
+        return not needed or self._find_simulated_dispatch()
 
     def _copy_row(self, i: int) -> None:
         """Bring the simulated environment to where environment ``i`` is."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from rl2grid.compile import jit
+from rl2grid.engines.native.generation import set_generators
 from rl2grid.engines.native.simulation import begin_simulation, finish_simulation
 from rl2grid.engines.native.step import begin_step, dispatch_or_lose, finish_step, lose_by_dispatch, reset_row
 from rl2grid.engines.native.tables import (
@@ -117,6 +118,12 @@ def begin_simulation_one(
 def dispatch_one(addresses: Addresses, i: int) -> bool:
     """Find the exact dispatch of environment ``i``, or end its episode."""
     return dispatch_or_lose(open_state(addresses[STATE]), open_memory(addresses[MEMORY]), i)
+
+
+@jit
+def set_generators_one(addresses: Addresses, i: int) -> None:
+    """Set the generators of environment ``i`` to the series' production plus the dispatch."""
+    set_generators(open_state(addresses[STATE]), open_memory(addresses[MEMORY]), i)
 
 
 @jit

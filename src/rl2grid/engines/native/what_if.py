@@ -1,0 +1,267 @@
+"""What every action, or every outage, would do to the line loadings of a moment: one call (``docs/what_if.md``).
+
+The power flow of the topology after the action is solved, as a step would solve it; protections do not trip lines.
+"""
+
+from __future__ import annotations
+
+import enum
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rl2grid.engines.native.engine import NativeEngine
+from rl2grid.engines.native.tables import Arrays
+from rl2grid.errors import UsageError
+from rl2grid.grids import Grid
+from rl2grid.handles import table_of
+from rl2grid.mdp.actions import ActionCatalogue, ActionKind, Ids
+from rl2grid.mdp.termination import GameOver
+from rl2grid.powerflow.batch import (
+    MOVE,
+    NOTHING,
+    SWITCH,
+    Bench,
+    Changes,
+    Outcomes,
+    Snapshot,
+    new_outcomes,
+    new_snapshot,
+    new_wiring,
+)
+from rl2grid.powerflow.model import Network, load_network
+
+F32 = NDArray[np.float32]
+I8 = NDArray[np.int8]
+I32 = NDArray[np.int32]
+Flags = NDArray[np.bool_]
+
+_KINDS = np.full(len(ActionKind), -1, np.int8)
+_KINDS[[ActionKind.NOTHING, ActionKind.MOVE, ActionKind.SWITCH]] = NOTHING, MOVE, SWITCH
+_SMALLEST_PART = 64
+"""Changes that are worth a thread."""
+_DISPATCH = int(GameOver.DISPATCH)
+
+
+class Moment(enum.Enum):
+    """Of which injections, planned outages and cooldowns a question is."""
+
+    PRESENT = "present"
+    """Those of the last observation."""
+    NEXT_STEP = "next step"
+    """Those of the forecast for the next step, as ``simulate`` plays it."""
+
+
+class ActionOutcomes(NamedTuple):
+    """What each action would do; entry k belongs to the k-th action asked."""
+
+    worst_loading: F32  # [action] largest current over thermal limit, inf where no flow is found
+    verdict: I8  # [action] rl2grid.mdp.termination.GameOver: NONE, or why no flow is found
+    overloads: I32  # [action] lines above their thermal limit, 0 where no flow is found
+    legal: Flags  # [action] the cooldowns allow it; the other fields do not look at that
+
+
+class OutageOutcomes(NamedTuple):
+    """What the loss of each line would do; entry k belongs to the k-th line asked."""
+
+    worst_loading: F32  # [outage] largest current over thermal limit, inf where no flow is found
+    verdict: I8  # [outage] rl2grid.mdp.termination.GameOver: NONE, or why no flow is found
+    overloads: I32  # [outage] lines above their thermal limit, 0 where no flow is found
+    was_open: Flags  # [outage] the line is open already: the other fields are the present ones
+
+
+class Security(NamedTuple):
+    """The outages of a moment in two numbers."""
+
+    worst_loading: float  # largest over all outages, inf if one of them leaves no flow
+    n_unsafe: int  # outages that leave an overload or no flow
+    n_outages: int  # lines in service
+
+
+class WhatIf:
+    """Answers what-if questions about one grid; keeps the workspace, so make it once.
+
+    Not for several threads at a time.
+
+    Args:
+        grid: the grid.
+        network: electrical model; that of ``grid`` if left out, which must then be one of the seven.
+        num_threads: threads that share a call; every number gives the same bits.
+
+    Raises:
+        UsageError: not a positive number of threads.
+    """
+
+    def __init__(self, grid: Grid, network: Network | None = None, num_threads: int = 1) -> None:
+        if num_threads < 1:
+            raise UsageError(f"num_threads={num_threads} is not allowed: give at least 1.")
+        self.grid = grid
+        self._network = load_network(grid) if network is None else network
+        wiring = new_wiring(grid, self._network)
+        self._snapshot = new_snapshot(grid)
+        self._benches = [Bench(grid, self._network, wiring, self._snapshot) for _ in range(num_threads)]
+        self._threads = ThreadPoolExecutor(num_threads, "what-if")
+
+    def actions(
+        self, snapshot: Snapshot, catalogue: ActionCatalogue, ids: Ids | None = None, rho: F32 | None = None
+    ) -> ActionOutcomes:
+        """The flow after each action, from one operating point.
+
+        Args:
+            snapshot: the operating point.
+            catalogue: the actions; of kinds NOTHING, MOVE and SWITCH.
+            ids: those to ask for, int32 [action]; all of them if left out.
+            rho: where the loadings of all lines are to be written, float32 [action, line].
+
+        Raises:
+            UsageError: an action of another kind, or ``rho`` of another shape.
+        """
+        if ids is not None:
+            catalogue = catalogue.take(ids)
+        kind = _KINDS[catalogue.kind]
+        if (kind < 0).any():
+            raise UsageError("A what-if is for actions of kind NOTHING, MOVE and SWITCH; others have no topology.")
+        changes = Changes(kind, catalogue.target, catalogue.mask)
+        outcomes = self.solve(snapshot, changes, rho)
+        return ActionOutcomes(*outcomes[:3], legal_changes(snapshot, changes))
+
+    def outages(self, snapshot: Snapshot, lines: Ids | None = None, rho: F32 | None = None) -> OutageOutcomes:
+        """The flow after the loss of each line (N-1), all others as they are.
+
+        Args:
+            snapshot: the operating point.
+            lines: those to lose, one at a time, int32 [outage]; all of them if left out.
+            rho: where the loadings of all lines are to be written, float32 [outage, line].
+
+        Raises:
+            UsageError: ``rho`` of another shape.
+        """
+        chosen = np.arange(self.grid.n_line, dtype=np.int32) if lines is None else np.asarray(lines, np.int32)
+        ends = self.grid.line_or_pos_topo_vect[chosen], self.grid.line_ex_pos_topo_vect[chosen]
+        was_open = (snapshot.topo_vect[ends[0]] < 1) & (snapshot.topo_vect[ends[1]] < 1)
+        kind = np.where(was_open, NOTHING, SWITCH).astype(np.int8)
+        outcomes = self.solve(snapshot, Changes(kind, chosen, np.zeros(len(chosen), np.uint32)), rho)
+        return OutageOutcomes(*outcomes[:3], was_open)
+
+    def security(self, snapshot: Snapshot) -> Security:
+        """The N-1 analysis of all lines in service in two numbers."""
+        outcomes = self.outages(snapshot)
+        lost = ~outcomes.was_open
+        if not lost.any():
+            return Security(0.0, 0, 0)
+        unsafe = (outcomes.verdict != 0) | (outcomes.overloads > 0)
+        return Security(float(outcomes.worst_loading[lost].max()), int(unsafe[lost].sum()), int(lost.sum()))
+
+    def solve(self, snapshot: Snapshot, changes: Changes, rho: F32 | None = None) -> Outcomes:
+        """The flow after each change; see :func:`rl2grid.powerflow.batch.solve_changes`."""
+        n, n_line = len(changes.kind), self.grid.n_line
+        if rho is not None and (rho.shape != (n, n_line) or rho.dtype != np.float32 or not rho.flags.c_contiguous):
+            raise UsageError(f"rho must be a contiguous float32 array of shape ({n}, {n_line}), got {rho.shape}.")
+        for kept, array in zip(self._snapshot, snapshot, strict=True):
+            np.copyto(kept, array)
+        outcomes = new_outcomes(n, np.zeros((0, n_line), np.float32) if rho is None else rho)
+        tables = table_of(changes), table_of(outcomes)
+        order = np.lexsort((changes.target, -changes.kind)).astype(np.int32)
+        parts = self._parts(order)
+
+        def solve_part(k: int) -> None:
+            self._benches[k].solve(*tables, parts[k])
+
+        if len(parts) == 1:
+            solve_part(0)
+        else:
+            list(self._threads.map(solve_part, range(len(parts))))
+        return outcomes
+
+    def _parts(self, order: I32) -> list[I32]:
+        n_parts = min(len(self._benches), len(order) // _SMALLEST_PART)
+        return np.array_split(order, n_parts) if n_parts > 1 else [order]
+
+
+def snapshot_of(engine: NativeEngine, i: int) -> Snapshot:
+    """The operating point of environment ``i`` as last observed; copies, a few kB.
+
+    Raises:
+        UsageError: the environment is not in an episode.
+    """
+    if engine.state.terminated[i] or not engine.state.line_status[i].any():
+        raise UsageError("Nothing can be asked after a game over or before a reset: reset the environment first.")
+    return _snapshot(engine.arrays, i)
+
+
+def forecast_of(engine: NativeEngine, i: int, horizon: int = 1) -> Snapshot | None:
+    """The operating point of environment ``i`` on the forecast ``horizon`` steps ahead, before anybody acts.
+
+    Returns:
+        The operating point, or None if the generators cannot follow the forecast: the game is then lost, whatever
+        the topology.
+
+    Raises:
+        UsageError: after a game over, or without such a forecast.
+    """
+    arrays = engine.foresee(i, horizon)
+    return None if arrays is None else _snapshot(arrays, 0)
+
+
+def what_if(
+    engine: NativeEngine,
+    i: int,
+    catalogue: ActionCatalogue,
+    ids: Ids | None = None,
+    moment: Moment = Moment.PRESENT,
+    num_threads: int = 1,
+) -> ActionOutcomes:
+    """The flow after each action in environment ``i``; see :meth:`WhatIf.actions`.
+
+    Where the generators cannot follow the forecast, every verdict is DISPATCH.
+    """
+    snapshot = snapshot_of(engine, i) if moment is Moment.PRESENT else forecast_of(engine, i)
+    if snapshot is None:
+        n = len(catalogue) if ids is None else len(ids)
+        nothing = np.zeros(n, np.int32)
+        return ActionOutcomes(np.full(n, np.inf, np.float32), np.full(n, _DISPATCH, np.int8), nothing, nothing == 0)
+    return _solver_of(engine, num_threads).actions(snapshot, catalogue, ids)
+
+
+def n_minus_1_score(engine: NativeEngine, i: int) -> float:
+    """Share of the lines in service whose loss would leave neither an overload nor a collapse."""
+    security = _solver_of(engine, 1).security(snapshot_of(engine, i))
+    return 1.0 - security.n_unsafe / max(security.n_outages, 1)
+
+
+def _solver_of(engine: NativeEngine, num_threads: int) -> WhatIf:
+    """The solver that an engine has used before, or a new one."""
+    solvers = _SOLVERS.setdefault(engine, {})
+    if num_threads not in solvers:
+        solvers[num_threads] = WhatIf(engine.grid, engine.arrays.network, num_threads)
+    return solvers[num_threads]
+
+
+_SOLVERS: WeakKeyDictionary[NativeEngine, dict[int, WhatIf]] = WeakKeyDictionary()
+
+
+def _snapshot(arrays: Arrays, i: int) -> Snapshot:
+    state, memory = arrays.state, arrays.memory
+    return Snapshot(
+        state.topo_vect[i].copy(),
+        memory.last_bus[i].copy(),
+        state.time_before_cooldown_line[i].copy(),
+        state.time_before_cooldown_sub[i].copy(),
+        memory.gen_p[i].copy(),
+        memory.gen_v[i].astype(np.float32),
+        memory.load_p[i].copy(),
+        memory.load_q[i].copy(),
+        state.storage_power[i].copy(),
+    )
+
+
+def legal_changes(snapshot: Snapshot, changes: Changes) -> Flags:
+    """Which changes the cooldowns allow, bool [change]; the rule of :func:`rl2grid.mdp.actions.is_legal`."""
+    legal = np.ones(len(changes.kind), np.bool_)
+    moves, switches = changes.kind == MOVE, changes.kind == SWITCH
+    legal[moves] = snapshot.cooldown_sub[changes.target[moves]] == 0
+    legal[switches] = snapshot.cooldown_line[changes.target[switches]] == 0
+    return legal

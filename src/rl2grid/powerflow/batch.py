@@ -1,0 +1,618 @@
+"""AC power flows of many changed topologies of one operating point, side by side (``docs/what_if.md``).
+
+Injections are those of the base case; each change moves elements between the busbars of one substation or switches
+one line. Flows start from the base case's voltages and use its factors; whatever does not settle quickly, and near
+the base case, is asked of the cold recipe of :func:`rl2grid.powerflow.ac.run_flow`, whose verdict counts.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rl2grid.grids import Grid, load_grid
+from rl2grid.handles import Table, layout_of, opener, table_of
+from rl2grid.powerflow.ac import (
+    CONVERGED,
+    DISCONNECTED,
+    FlowState,
+    forget_flow,
+    new_flow_state,
+    run_flow,
+    write_currents,
+)
+from rl2grid.powerflow.borrowing import borrowing_jit
+from rl2grid.powerflow.factors import factorise
+from rl2grid.powerflow.flow_state import ABSENT, F32, I32, Equations, Factors, Index
+from rl2grid.powerflow.lane_flow import (
+    DONE,
+    EMPTY,
+    RUNNING,
+    LaneFlow,
+    dismiss_distant_lanes,
+    find_worst,
+    new_lane_flow,
+)
+from rl2grid.powerflow.lane_moves import (
+    CONNECTED,
+    EXTREMITY,
+    GENERATOR,
+    GENERATORS,
+    HAS_SHUNT,
+    LINES,
+    LOAD,
+    LOADS,
+    N_ELEMENTS,
+    N_PARTS,
+    ORIGIN,
+    SECOND,
+    STORAGE,
+    STORAGES,
+    Site,
+    Wiring,
+    new_site,
+    open_site,
+    place_lane,
+    solve_moves,
+)
+from rl2grid.powerflow.lane_switches import Switches, is_bridge, new_switches, place_switch, solve_switches
+from rl2grid.powerflow.lanes import WIDTH
+from rl2grid.powerflow.model import Network, load_network
+from rl2grid.powerflow.newton import fill_jacobian
+from rl2grid.powerflow.paths import Paths, new_paths, write_path
+
+I64 = NDArray[np.int64]
+I8 = NDArray[np.int8]
+U32 = NDArray[np.uint32]
+Flags = NDArray[np.bool_]
+
+NOTHING, MOVE, SWITCH = range(3)
+"""Kinds of changes: none; masked elements of a substation to the other busbar; a line opened, or closed."""
+SOLVED, LOAD_CUT_OFF, GENERATOR_CUT_OFF, STORAGE_CUT_OFF, ISLAND, NO_SOLUTION = range(6)
+"""Verdicts, numbered and ordered as the reasons of a game over (``rl2grid.mdp.termination.GameOver``)."""
+_SETPOINT_TOLERANCE = 1e-7
+"""Per unit, as in :mod:`rl2grid.powerflow.ac`."""
+_BASE: Any = np.int64(0)
+_ALONE: Any = np.int64(1)
+"""Rows of a task's flow: the base case; one change after another, solved cold."""
+
+
+class Snapshot(NamedTuple):
+    """An operating point: everything on which the flows after any change depend; shapes in brackets."""
+
+    topo_vect: I32  # [topo] busbar of each element, -1 when disconnected
+    last_bus: I32  # [topo] busbar each element is on or was on last, where a line end returns to
+    cooldown_line: I32  # [line] steps before the line may be switched
+    cooldown_sub: I32  # [sub] steps before the substation may be changed
+    gen_p: F32  # [gen] MW
+    gen_v: F32  # [gen] voltage set-point, per unit of the nominal voltage
+    load_p: F32  # [load] MW
+    load_q: F32  # [load] MVAr
+    storage_p: F32  # [storage] MW, positive charges
+
+
+class Changes(NamedTuple):
+    """What is asked; entry by entry."""
+
+    kind: I8  # [change] NOTHING, MOVE or SWITCH
+    target: I32  # [change] substation or line
+    mask: U32  # [change] MOVE: bit k is the k-th element of the substation
+
+
+class Outcomes(NamedTuple):
+    """The flow after each change; entry by entry."""
+
+    worst_loading: F32  # [change] largest current over thermal limit; inf where there is no flow
+    verdict: I8  # [change] SOLVED, or why there is no flow
+    overloads: I32  # [change] lines above their thermal limit
+    cold: Flags  # [change] the cold recipe was asked
+    rho: F32  # [change, line] loadings, inf where there is no flow; or [0, line]: not wanted
+
+
+class Scratch(NamedTuple):
+    """Workspace of flows that are solved alone."""
+
+    topo_vect: I32  # [topo]
+    current: F32  # [line] A
+    parent: I32  # [bus]
+    fed: I32  # [bus] 1 where a closed line ends
+
+
+class Task(NamedTuple):
+    """All that compiled code works with: handles (:mod:`rl2grid.handles`), which cost nothing to pass on."""
+
+    network: Network
+    wiring: Wiring
+    flow: FlowState
+    paths: Paths
+    lane_flow: LaneFlow
+    site: Site
+    switches: Switches
+    scratch: Scratch
+    snapshot: Snapshot
+    changes: Changes
+    outcomes: Outcomes
+
+
+class Bench:
+    """Workspace of one thread.
+
+    Args:
+        grid: the grid.
+        network: its electrical model.
+        wiring: see :func:`new_wiring`.
+        snapshot: arrays that hold the operating point whenever :meth:`solve` is called.
+    """
+
+    def __init__(self, grid: Grid, network: Network, wiring: Wiring, snapshot: Snapshot) -> None:
+        self._arrays = (*_new_workspace(grid, network, wiring), snapshot)
+        self._tables = [table_of(arrays) for arrays in self._arrays]
+        self._addresses = np.array([table.ctypes.data for table in self._tables] + [0, 0], np.int64)
+
+    def solve(self, changes: Table, outcomes: Table, order: I32) -> None:
+        """Solve the flows after the changes ``order``; see :func:`solve_changes`.
+
+        Args:
+            changes: table of :class:`Changes`.
+            outcomes: table of :class:`Outcomes`.
+            order: as there.
+        """
+        self._addresses[-2:] = changes.ctypes.data, outcomes.ctypes.data
+        solve_changes(self._addresses, order)
+
+
+def new_snapshot(grid: Grid) -> Snapshot:
+    """A blank operating point."""
+
+    def ints(n: int) -> I32:
+        return np.zeros(n, np.int32)
+
+    def floats(n: int) -> F32:
+        return np.zeros(n, np.float32)
+
+    return Snapshot(
+        ints(grid.dim_topo), ints(grid.dim_topo), ints(grid.n_line), ints(grid.n_sub), floats(grid.n_gen),
+        floats(grid.n_gen), floats(grid.n_load), floats(grid.n_load), floats(grid.n_storage),
+    )  # fmt: skip
+
+
+def _new_workspace(grid: Grid, network: Network, wiring: Wiring) -> tuple[Any, ...]:
+    """The first eight parts of a task."""
+    n_bus = 2 * grid.n_sub
+    ints = np.int32
+    return (
+        network,
+        wiring,
+        new_flow_state(network, 2),
+        new_paths(n_bus, 2 * n_bus),
+        new_lane_flow(n_bus, grid.n_line),
+        new_site(n_bus, int(grid.sub_info.max())),
+        new_switches(n_bus),
+        Scratch(
+            np.zeros(grid.dim_topo, ints),
+            np.zeros(grid.n_line, np.float32),
+            np.zeros(n_bus, ints),
+            np.zeros(n_bus, ints),
+        ),
+    )
+
+
+def new_outcomes(n: int, rho: F32) -> Outcomes:
+    """Room for the outcomes of ``n`` changes; ``rho``, float32 [n, line] or [0, line], is written where it lies."""
+    return Outcomes(np.empty(n, np.float32), np.empty(n, np.int8), np.empty(n, np.int32), np.empty(n, np.bool_), rho)
+
+
+def new_wiring(grid: Grid, network: Network) -> Wiring:
+    """What batched flows read of a grid beside its network."""
+    kind, index = np.zeros(grid.dim_topo, np.int32), np.zeros(grid.dim_topo, np.int32)
+    groups = (
+        (ORIGIN, grid.line_or_pos_topo_vect),
+        (EXTREMITY, grid.line_ex_pos_topo_vect),
+        (GENERATOR, grid.gen_pos_topo_vect),
+        (LOAD, grid.load_pos_topo_vect),
+        (STORAGE, grid.storage_pos_topo_vect),
+    )
+    for name, positions in groups:
+        kind[positions] = name
+        index[positions] = np.arange(len(positions))
+    shunt = np.zeros((grid.n_sub, 2))
+    np.add.at(shunt, network.shunt_sub, network.shunt_admittance)
+    nominal = network.nominal_voltage[network.line_or_sub]
+    ampere = network.base_power[0] / (math.sqrt(3.0) * nominal) * 1000.0
+    return Wiring(
+        grid.sub_first_element, grid.sub_info, kind, index, shunt, ampere / grid.thermal_limit, grid.thermal_limit
+    )
+
+
+_GRID = load_grid("bus14")
+_NETWORK = load_network(_GRID)
+_EXAMPLE = _new_workspace(_GRID, _NETWORK, new_wiring(_GRID, _NETWORK))
+"""Layouts are the same for every grid: names, dtypes and axes."""
+_open_network, _open_wiring, _open_flow, _open_paths, _open_lane_flow, _open_site, _open_switches, _open_scratch = (
+    opener(type(arrays).__name__, layout_of(arrays)) for arrays in _EXAMPLE
+)
+_open_snapshot = opener("Snapshot", layout_of(new_snapshot(_GRID)))
+_open_changes = opener(
+    "Changes", layout_of(Changes(np.zeros(0, np.int8), np.zeros(0, np.int32), np.zeros(0, np.uint32)))
+)
+_open_outcomes = opener("Outcomes", layout_of(new_outcomes(0, np.zeros((0, 0), np.float32))))
+
+
+@borrowing_jit
+def solve_changes(addresses: I64, order: I32) -> None:
+    """Solve the flows after some changes.
+
+    Args:
+        addresses: int64 [11], of the tables of the parts of a :class:`Task`.
+        order: int32 [k], which changes to solve; moves of one substation in a row. Only their outcomes are written.
+    """
+    task = Task(
+        _open_network(addresses[0]),
+        _open_wiring(addresses[1]),
+        _open_flow(addresses[2]),
+        _open_paths(addresses[3]),
+        _open_lane_flow(addresses[4]),
+        _open_site(addresses[5]),
+        _open_switches(addresses[6]),
+        _open_scratch(addresses[7]),
+        _open_snapshot(addresses[8]),
+        _open_changes(addresses[9]),
+        _open_outcomes(addresses[10]),
+    )
+    network, flow, snapshot, changes = task.network, task.flow, task.snapshot, task.changes
+    forget_flow(flow, _BASE)
+    status = run_flow(
+        network, flow, _BASE, snapshot.topo_vect, snapshot.gen_p, snapshot.gen_v, snapshot.load_p, snapshot.load_q,
+        snapshot.storage_p,
+    )  # fmt: skip
+    if status != CONVERGED or not flow.known[_BASE]:
+        for k in range(order.shape[0]):
+            _solve_alone(task, order[k])
+        return
+    n_free = np.int64(flow.n_node[_BASE]) - 1
+    first_unknown = flow.first_unknown[_BASE]
+    equations = Equations(
+        n_free,
+        first_unknown,
+        flow.admittance_first[_BASE],
+        flow.admittance_node[_BASE],
+        flow.admittance[_BASE],
+        flow.admittance_panel[_BASE],
+        flow.magnitude[_BASE],
+        flow.angle[_BASE],
+        flow.voltage[_BASE],
+        flow.injection[_BASE],
+        flow.power[_BASE],
+        flow.step[_BASE],
+    )
+    factors = Factors(
+        n_free,
+        first_unknown,
+        flow.node_of_unknown[_BASE],
+        flow.first_column[_BASE],
+        flow.own_column[_BASE],
+        flow.first_panel[_BASE],
+        flow.own_panel[_BASE],
+        flow.column[_BASE],
+        flow.panel[_BASE],
+        flow.sparse_row[_BASE],
+    )
+    begin = 0
+    n = order.shape[0]
+    while begin < n:
+        kind, target = changes.kind[order[begin]], changes.target[order[begin]]
+        end = begin + 1
+        while end < n and changes.kind[order[end]] == kind and (kind != MOVE or changes.target[order[end]] == target):
+            end += 1
+        if kind == NOTHING:
+            _repeat_base(task, order[begin:end])
+        elif kind == SWITCH:
+            _solve_switches(task, equations, factors, order[begin:end])
+        else:
+            _solve_moves(task, equations, factors, order[begin:end])
+        begin = end
+
+
+@borrowing_jit
+def _repeat_base(task: Task, order: I32) -> None:
+    outcomes = task.outcomes
+    write_currents(task.network, task.flow, _BASE, task.scratch.current)
+    for k in range(order.shape[0]):
+        outcomes.cold[order[k]] = False
+        _write_solution(task, order[k])
+
+
+@borrowing_jit
+def _write_solution(task: Task, change: Index) -> None:
+    """The outcome that the currents in the scratch mean."""
+    outcomes, current, limit, rho = task.outcomes, task.scratch.current, task.wiring.thermal_limit, task.outcomes.rho
+    worst = np.float32(0.0)
+    overloads = 0
+    for line in range(limit.shape[0]):
+        loading = current[line] / limit[line]
+        worst = max(worst, loading)
+        overloads += 1 if loading > np.float32(1.0) else 0
+        if rho.shape[0] > 0:
+            rho[change, line] = loading
+    outcomes.worst_loading[change] = worst
+    outcomes.overloads[change] = overloads
+    outcomes.verdict[change] = SOLVED
+
+
+@borrowing_jit
+def _write_failure(task: Task, change: Index, verdict: int) -> None:
+    outcomes, rho = task.outcomes, task.outcomes.rho
+    outcomes.worst_loading[change] = np.inf
+    outcomes.overloads[change] = 0
+    outcomes.verdict[change] = verdict
+    if rho.shape[0] > 0:
+        for line in range(rho.shape[1]):
+            rho[change, line] = np.inf
+
+
+@borrowing_jit
+def _solve_alone(task: Task, change: Index) -> None:
+    """Solve one change by the cold recipe."""
+    network, flow, snapshot, scratch = task.network, task.flow, task.snapshot, task.scratch
+    _write_topology(task, change)
+    forget_flow(flow, _ALONE)
+    status = run_flow(
+        network, flow, _ALONE, scratch.topo_vect, snapshot.gen_p, snapshot.gen_v, snapshot.load_p, snapshot.load_q,
+        snapshot.storage_p,
+    )  # fmt: skip
+    task.outcomes.cold[change] = True
+    if status == CONVERGED:
+        write_currents(network, flow, _ALONE, scratch.current)
+        _write_solution(task, change)
+        return
+    verdict = NO_SOLUTION
+    if status == DISCONNECTED:
+        verdict = _why_disconnected(task)
+    _write_failure(task, change, verdict)
+
+
+@borrowing_jit
+def _write_topology(task: Task, change: Index) -> None:
+    network, snapshot, changes, topo_vect = task.network, task.snapshot, task.changes, task.scratch.topo_vect
+    kind, target = changes.kind[change], changes.target[change]
+    for element in range(topo_vect.shape[0]):
+        topo_vect[element] = snapshot.topo_vect[element]
+    if kind == MOVE:
+        first = task.wiring.sub_first_element[target]
+        mask = changes.mask[change]
+        k = 0
+        while mask >> np.uint32(k) != 0:
+            if (mask >> np.uint32(k)) & np.uint32(1) and topo_vect[first + k] > 0:
+                topo_vect[first + k] = 3 - topo_vect[first + k]
+            k += 1
+    elif kind == SWITCH:
+        origin, extremity = network.line_or_position[target], network.line_ex_position[target]
+        if topo_vect[origin] > 0 or topo_vect[extremity] > 0:
+            topo_vect[origin] = -1
+            topo_vect[extremity] = -1
+        else:
+            topo_vect[origin] = snapshot.last_bus[origin]
+            topo_vect[extremity] = snapshot.last_bus[extremity]
+
+
+@borrowing_jit
+def _bus(topo_vect: I32, position: Index, sub: Index, n_sub: Index) -> Index:
+    """Bus of an element, -1 if it is off."""
+    busbar = topo_vect[position]
+    return -1 if busbar < 1 else np.int64(sub) + (np.int64(busbar) - 1) * n_sub
+
+
+@borrowing_jit
+def _why_disconnected(task: Task) -> int:
+    """Reason, in the order of a game over's, why the topology in the scratch is in pieces."""
+    network, storage_p = task.network, task.snapshot.storage_p
+    topo_vect, parent, fed = task.scratch.topo_vect, task.scratch.parent, task.scratch.fed
+    n_sub = network.nominal_voltage.shape[0]
+    for every in range(parent.shape[0]):
+        parent[every] = every
+        fed[every] = 0
+    for line in range(network.line_or_sub.shape[0]):
+        origin = _bus(topo_vect, network.line_or_position[line], network.line_or_sub[line], n_sub)
+        extremity = _bus(topo_vect, network.line_ex_position[line], network.line_ex_sub[line], n_sub)
+        if origin < 0 or extremity < 0:
+            continue
+        fed[origin] = 1
+        fed[extremity] = 1
+        parent[_find(parent, origin)] = _find(parent, extremity)
+    island = False
+    main = _bus(topo_vect, network.gen_position[network.slack_gen[0]], network.gen_sub[network.slack_gen[0]], n_sub)
+    for load in range(network.load_sub.shape[0]):
+        bus = _bus(topo_vect, network.load_position[load], network.load_sub[load], n_sub)
+        if bus < 0 or fed[bus] == 0:
+            return LOAD_CUT_OFF
+        island |= _find(parent, bus) != _find(parent, max(main, 0))
+    for gen in range(network.gen_sub.shape[0]):
+        bus = _bus(topo_vect, network.gen_position[gen], network.gen_sub[gen], n_sub)
+        if bus < 0 or fed[bus] == 0:
+            return GENERATOR_CUT_OFF
+        island |= _find(parent, bus) != _find(parent, main)
+    for storage in range(network.storage_sub.shape[0]):
+        bus = _bus(topo_vect, network.storage_position[storage], network.storage_sub[storage], n_sub)
+        if storage_p[storage] != 0.0 and (bus < 0 or fed[bus] == 0):
+            return STORAGE_CUT_OFF
+        island |= bool(bus >= 0 and _find(parent, max(bus, 0)) != _find(parent, main))
+    for every in range(parent.shape[0]):
+        island |= bool(fed[every] == 1 and _find(parent, every) != _find(parent, main))
+    return ISLAND if island else NO_SOLUTION
+
+
+@borrowing_jit
+def _find(parent: I32, bus: Index) -> Index:
+    while parent[bus] != bus:
+        parent[bus] = parent[parent[bus]]
+        bus = np.int64(parent[bus])
+    return bus
+
+
+@borrowing_jit
+def _solve_switches(task: Task, equations: Equations, factors: Factors, order: I32) -> None:
+    network, wiring, flow, changes = task.network, task.wiring, task.flow, task.changes
+    lane_flow, switches, paths = task.lane_flow, task.switches, task.paths
+    fill_jacobian(equations, factors)
+    solvable = factorise(factors)
+    if solvable:
+        for node in range(equations.n_free):
+            write_path(factors, node, paths, node)
+    for entry in range(equations.admittance_first[equations.n_free + 1]):
+        lane_flow.admittance[entry, 0] = equations.admittance[entry, 0]
+        lane_flow.admittance[entry, 1] = equations.admittance[entry, 1]
+    for node in range(equations.n_free):
+        lane_flow.injection[node, 0] = equations.injection[node, 0]
+        lane_flow.injection[node, 1] = equations.injection[node, 1]
+    lane = np.int64(0)
+    for k in range(order.shape[0]):
+        change = order[k]
+        line = changes.target[change]
+        opens = flow.line_or_node[_BASE, line] != ABSENT
+        origin: Index = -1
+        extremity: Index = -1
+        if opens and not is_bridge(flow, _BASE, equations, switches, line):
+            origin, extremity = np.int64(flow.line_or_node[_BASE, line]), np.int64(flow.line_ex_node[_BASE, line])
+        if not opens:
+            origin, extremity = _ends_if_closed(task, line)
+        if not solvable or origin < 0 or extremity < 0 or origin == extremity:
+            _solve_alone(task, change)
+            continue
+        place_switch(network, flow, _BASE, equations, paths, lane_flow, switches, lane, line, origin, extremity, opens)
+        lane_flow.action[lane] = change
+        lane += 1
+        if lane == WIDTH:
+            solve_switches(network, wiring.limit, flow, _BASE, equations, factors, paths, lane_flow, switches)
+            _finish_lanes(task)
+            lane = np.int64(0)
+    if lane > 0:
+        for idle in range(lane, WIDTH):
+            lane_flow.state[idle] = EMPTY
+        solve_switches(network, wiring.limit, flow, _BASE, equations, factors, paths, lane_flow, switches)
+        _finish_lanes(task)
+
+
+@borrowing_jit
+def _ends_if_closed(task: Task, line: Index) -> tuple[Index, Index]:
+    """Nodes that an open line joins when it is closed, -1 for a busbar without elements or a half-open line."""
+    network, flow, snapshot = task.network, task.flow, task.snapshot
+    n_sub = network.nominal_voltage.shape[0]
+    origin, extremity = network.line_or_position[line], network.line_ex_position[line]
+    if snapshot.topo_vect[origin] > 0 or snapshot.topo_vect[extremity] > 0:
+        return -1, -1
+    first = _bus(snapshot.last_bus, origin, network.line_or_sub[line], n_sub)
+    second = _bus(snapshot.last_bus, extremity, network.line_ex_sub[line], n_sub)
+    if first < 0 or second < 0:
+        return -1, -1
+    a, b = flow.node_of_bus[_BASE, first], flow.node_of_bus[_BASE, second]
+    if a == ABSENT or b == ABSENT:
+        return -1, -1
+    return np.int64(a), np.int64(b)
+
+
+@borrowing_jit
+def _finish_lanes(task: Task) -> None:
+    """Write what the lanes found; those that failed are solved alone."""
+    lane_flow, outcomes, rho = task.lane_flow, task.outcomes, task.outcomes.rho
+    dismiss_distant_lanes(lane_flow)
+    find_worst(lane_flow)
+    loading = lane_flow.loading
+    for lane in range(WIDTH):
+        if lane_flow.state[lane] == EMPTY:
+            continue
+        change = lane_flow.action[lane]
+        if lane_flow.state[lane] != DONE:
+            _solve_alone(task, change)
+            continue
+        worst = np.float32(lane_flow.worst[0, lane])
+        overloads = 0
+        if worst > np.float32(1.0):
+            for line in range(loading.shape[0]):
+                overloads += 1 if np.float32(math.sqrt(loading[line, lane])) > np.float32(1.0) else 0
+        outcomes.worst_loading[change] = worst
+        outcomes.overloads[change] = overloads
+        outcomes.verdict[change] = SOLVED
+        outcomes.cold[change] = False
+        if rho.shape[0] > 0:
+            for line in range(loading.shape[0]):
+                rho[change, line] = math.sqrt(loading[line, lane])
+
+
+@borrowing_jit
+def _solve_moves(task: Task, equations: Equations, factors: Factors, order: I32) -> None:
+    network, wiring, flow, changes, snapshot = task.network, task.wiring, task.flow, task.changes, task.snapshot
+    lane_flow, site, paths, outcomes = task.lane_flow, task.site, task.paths, task.outcomes
+    sub = changes.target[order[0]]
+    solvable = open_site(
+        network, wiring, flow, _BASE, equations, factors, paths, lane_flow, site, sub, snapshot.topo_vect,
+        snapshot.gen_p, snapshot.gen_v, snapshot.load_p, snapshot.load_q, snapshot.storage_p,
+    )  # fmt: skip
+    lane = np.int64(0)
+    for k in range(order.shape[0]):
+        change = order[k]
+        if not solvable:
+            _solve_alone(task, change)
+            continue
+        second = (site.members[SECOND] ^ changes.mask[change]) & site.members[CONNECTED]
+        verdict = _verdict_of_move(site, second)
+        if verdict != SOLVED:
+            outcomes.cold[change] = False
+            _write_failure(task, change, verdict)
+            continue
+        place_lane(wiring, site, lane, sub, second)
+        lane_flow.state[lane] = RUNNING
+        lane_flow.action[lane] = change
+        lane += 1
+        if lane == WIDTH:
+            solve_moves(network, wiring, flow, _BASE, equations, factors, paths, lane_flow, site)
+            _finish_lanes(task)
+            lane = np.int64(0)
+    if lane > 0:
+        for idle in range(lane, WIDTH):
+            lane_flow.state[idle] = EMPTY
+        solve_moves(network, wiring, flow, _BASE, equations, factors, paths, lane_flow, site)
+        _finish_lanes(task)
+
+
+@borrowing_jit
+def _verdict_of_move(site: Site, second: np.uint32) -> int:
+    """Whether the grid holds together with the elements ``second`` on busbar 2; if not, why."""
+    members = site.members
+    first = members[CONNECTED] & ~second
+    lonely = np.uint32(0)
+    if first & members[LINES] == 0:
+        lonely |= first
+    if second & members[LINES] == 0:
+        lonely |= second
+    if lonely & members[LOADS]:
+        return LOAD_CUT_OFF
+    if lonely & members[GENERATORS]:
+        return GENERATOR_CUT_OFF
+    if lonely & members[STORAGES]:
+        return STORAGE_CUT_OFF
+    if lonely != 0:
+        return ISLAND
+    if first == 0 and site.counts[HAS_SHUNT] == 1:
+        return NO_SOLUTION
+    if first != 0 and second != 0 and site.counts[N_PARTS] > 1:
+        joined = False
+        for part in range(site.counts[N_PARTS]):
+            joined |= (site.part[part] & first) != 0 and (site.part[part] & second) != 0
+        if not joined:
+            return ISLAND
+    return NO_SOLUTION if _setpoints_conflict(site, first) or _setpoints_conflict(site, second) else SOLVED
+
+
+@borrowing_jit
+def _setpoints_conflict(site: Site, here: np.uint32) -> bool:
+    """Whether generators on one busbar want different voltages."""
+    held = here & site.members[GENERATORS]
+    lowest, highest = np.inf, -np.inf
+    for k in range(site.counts[N_ELEMENTS]):
+        if (held >> np.uint32(k)) & np.uint32(1):
+            lowest = min(lowest, site.setpoint[k])
+            highest = max(highest, site.setpoint[k])
+    return highest - lowest > _SETPOINT_TOLERANCE
