@@ -33,7 +33,9 @@ from rl2grid.scenarios.generator.calendar import (
     ROWS_PER_HOUR,
     seasonal,
 )
-from rl2grid.scenarios.generator.constants import RenewableConstants, load_constants
+from rl2grid.scenarios.generator.constants import Constants, RenewableConstants, constants_from_record, load_constants
+from rl2grid.scenarios.generator.demand import active_demand, new_demand
+from rl2grid.scenarios.generator.draws import Portion
 from rl2grid.scenarios.generator.maintenance import generated_maintenance
 from rl2grid.scenarios.generator.renewables import new_weather, renewable_production
 from rl2grid.scenarios.generator.security import assess
@@ -104,9 +106,9 @@ WIND, SUN = {"bus118-M": 1.4}, {"bus118-M": 0.38}
 more sun."""
 MOST_SUN = 1.2
 """bus36-MO-v1 is bundled with days of more sun than pmax."""
-EXCHANGE_NOISE = 0.75
+EXCHANGE_NOISE = 0.95
 """Share of the variance of interconnections that they do not make up for among themselves, as a factor on its root."""
-LEVELS = {"bus14": 1.01, "bus36-M": 1.1, "bus36-MO-v0": 1.1, "bus36-MO-v1": 1.04}
+LEVELS = {"bus14": 1.01, "bus36-M": 1.18, "bus36-MO-v0": 1.1, "bus36-MO-v1": 1.04}
 """Factor on demand that brings the difficulty to its target; 1 where it is there already."""
 WANDER = 0.02
 GRID_STEP = 0.02
@@ -119,7 +121,7 @@ def calibrate(grid_id: str) -> dict[str, Any]:
     grid = load_grid(grid_id)
     own = bundled(grid)
     pool = [scenario for other in POOLS[grid_id] for scenario in bundled(load_grid(other))]
-    return {
+    record: dict[str, Any] = {
         "year": YEARS[grid_id],
         "demand": fit_demand(grid, pool),
         "renewables": fit_renewables(grid, own, pool),
@@ -127,6 +129,9 @@ def calibrate(grid_id: str) -> dict[str, Any]:
         "forecast": fit_forecast(grid, own),
         "voltage": None if own[0].prod_v is None else own[0].prod_v[0].tolist(),
     }
+    if any(record["demand"]["absorb"]):
+        record["demand"]["surplus"] = usual_surplus(grid, constants_from_record(record))
+    return record
 
 
 def bundled(grid: Grid) -> list[Scenario]:
@@ -186,19 +191,20 @@ def fit_demand(grid: Grid, scenarios: list[Scenario]) -> dict[str, Any]:
         second = np.diff(values, n=2, axis=0) / values.mean(axis=0)
         noise.append(np.median(second.std(axis=0)) / np.sqrt(6))
     reactive = np.tile([0.0, 0.7], (n, 1))
-    exchange = {name: np.zeros(n) for name in ("slow", "fast", "low", "high")}
+    exchange = {name: np.zeros(n) for name in ("slow", "fast", "low", "high", "absorb")}
     curve, mean = np.zeros((n, 24)), np.zeros((n, 12))
+    unusual = unusual_surplus(grid, signed, scenarios)
     for load in signed:
         p = np.concatenate([s.load_p[:, load] for s in scenarios]).astype(float)
         q = np.concatenate([s.load_q[:, load] for s in scenarios]).astype(float)
         slope, level = np.polyfit(p, q, 1)
         reactive[load] = level, slope
-        level = exchange_level(
-            [s.load_p[:, load].mean() for s in scenarios], [s.start_datetime.month for s in scenarios]
-        )
-        mean[load] = level
+        level = month_means([s.load_p[:, load] for s in scenarios], scenarios)
+        mean[load] = exchange_level(level)
+        power = np.concatenate([s.load_p[:, load] - level[s.start_datetime.month] for s in scenarios])
+        exchange["absorb"][load] = share = round(float(power @ unusual / (unusual @ unusual)), 3)
         hours = np.concatenate([day_parts(s, YEARS[grid.id])[1] for s in scenarios])
-        rest = np.concatenate([s.load_p[:, load] - level[s.start_datetime.month - 1] for s in scenarios])
+        rest = power - share * unusual
         curve[load] = [rest[hours == h].mean() for h in range(24)]
         rest -= curve[load][hours]
         curve[load] -= curve[load].mean()
@@ -225,14 +231,46 @@ def fit_demand(grid: Grid, scenarios: list[Scenario]) -> dict[str, Any]:
         "mean": _round(mean, 1),
         "curve": _round(curve, 1),
         **{name: _round(array, 3) for name, array in exchange.items()},
+        "surplus": [0.0] * 12,
     }
 
 
-def exchange_level(means: list[float], months: list[int]) -> Floats:
+def unusual_surplus(grid: Grid, signed: NDArray[np.int64], scenarios: list[Scenario]) -> Floats:
+    """[row] MW of wind and sun less ordinary demand, relative to the mean of the calendar month."""
+    ordinary = np.setdiff1d(np.arange(grid.n_load), signed)
+    surplus = [
+        (s.prod_p[:, grid.gen_renewable].sum(axis=1) - s.load_p[:, ordinary].sum(axis=1)).astype(float)
+        for s in scenarios
+    ]
+    level = month_means(surplus, scenarios)
+    return np.concatenate([x - level[s.start_datetime.month] for x, s in zip(surplus, scenarios, strict=True)])
+
+
+def month_means(series: list[Any], scenarios: list[Scenario]) -> dict[int, float]:
+    """Mean of the rows of every calendar month (1 .. 12) that is bundled."""
+    months = np.repeat([s.start_datetime.month for s in scenarios], [len(values) for values in series])
+    rows = np.concatenate(series)
+    return {int(month): float(rows[months == month].mean()) for month in np.unique(months)}
+
+
+def usual_surplus(grid: Grid, constants: Constants) -> list[float]:
+    """[12] mean of generated wind and sun less ordinary demand around the middle of each calendar month, MW."""
+    ordinary = constants.demand.base > 0
+    rows = 365 * ROWS_PER_DAY
+    month = (np.arange(rows) * 12) // rows
+    totals = []
+    for seed in range(FIRST_SEED, FIRST_SEED + 12):
+        portion = Portion(seed, 0, 0, rows)
+        renewables = renewable_production(new_weather(grid, constants.renewables, portion))
+        active = active_demand(new_demand(grid, constants, portion), renewables)
+        totals.append(renewables.sum(axis=1) - active[:, ordinary].sum(axis=1))
+    mean = np.mean(totals, axis=0) / 10
+    return _round([mean[month == k].mean() for k in range(12)], 1)
+
+
+def exchange_level(means: dict[int, float]) -> Floats:
     """[12] usual power of an interconnection: February, April and August are bundled, between them it drifts."""
-    winter, spring, summer = (
-        np.mean([m for m, k in zip(means, months, strict=True) if k == month]) for month in (2, 4, 8)
-    )
+    winter, spring, summer = means[2], means[4], means[8]
     known = np.array([1.0, 2.0, 4.0, 8.0, 9.0, 12.0, 13.0])
     return np.interp(np.arange(1, 13), known, [winter, winter, spring, summer, summer, winter, winter])
 
@@ -246,7 +284,7 @@ def fit_renewables(grid: Grid, own: list[Scenario], pool: list[Scenario]) -> dic
     )
 
     rows = 365 * ROWS_PER_DAY
-    cache = [renewable_production(new_weather(grid, unit, seed, 0, rows), 0, rows) / 10 for seed in range(6)]
+    cache = [renewable_production(new_weather(grid, unit, Portion(seed, 0, 0, rows))) / 10 for seed in range(6)]
     factor = {}
     for kind in ("wind", "solar"):
         gens = np.flatnonzero(kinds == kind)
@@ -424,7 +462,7 @@ def compare(grid_id: str, seeds: int) -> dict[str, Any]:
     return {"bundled": _describe(grid, constants, real), "generated": _describe(grid, constants, made)}
 
 
-def _describe(grid: Grid, constants: Any, series: list[Any]) -> dict[str, Any]:
+def _describe(grid: Grid, constants: Constants, series: list[Any]) -> dict[str, Any]:
     kinds = np.array(grid.gen_type)
     demand = [p.sum(axis=1) / 10 for p, _, _ in series]
     verdicts = [assess(grid, constants.voltage, *each) for each in series]

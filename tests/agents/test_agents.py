@@ -30,7 +30,7 @@ class Stage(gymnasium.Env[Any, Any]):
         self.mask = np.array(mask if mask is not None else [True] * 5)
         self.grid = load_grid("bus14")
         self.action_catalogue_ids = level_ids(self.grid, level)
-        self.step_listeners: list[Any] = []
+        self.state = new_state(self.grid, 1)
 
     def action_masks(self) -> np.ndarray[Any, Any]:
         return self.mask
@@ -94,21 +94,19 @@ def test_random_actions_are_a_function_of_seed_and_episode():
 
 
 class Grid14:
-    """A calm bus14 and the recovery agent that hears of it."""
+    """A calm bus14 and the recovery agent that looks at it."""
 
     def __init__(self, level: int = 1) -> None:
         self.env = Stage(DISCRETE, level=level)
         self.agent = Recovery()
         self.agent.bind(self.env)
-        self.state = new_state(self.env.grid, 1)
+        self.state = self.env.state
         self.state.rho[0] = 0.5
         self.state.line_status[0] = True
         self.state.topo_vect[0] = 1
         self.actions = full_catalogue(self.env.grid).take(self.env.action_catalogue_ids)
 
     def act(self) -> int:
-        for listener in self.env.step_listeners:
-            listener(self.state, 0)
         return self.agent.act(OBSERVATION, {})
 
 

@@ -11,6 +11,7 @@ from rl2grid.analysis import scenario_check
 from rl2grid.analysis.scenario_check import HEADINGS, Comparison, autocorrelation, compare, distance, measure
 from rl2grid.errors import UsageError
 from rl2grid.grids import load_grid
+from rl2grid.scenarios.generated import VERSION
 from rl2grid.scenarios.library import load_scenario
 
 BUS14 = load_grid("bus14")
@@ -88,10 +89,10 @@ def test_the_page_needs_no_other_file(comparison: Comparison, tmp_path: Path) ->
     path = tmp_path / "new" / "page.html"
     scenario_check.write_page(comparison, path)
     text = path.read_text()
-    assert text.count("data:image/png;base64,") == 4
+    assert text.count("data:image/png;base64,") == 8
     assert set(re.findall(r"(?:src|href)=['\"]?(\w+:)", text)) == {"data:"}
     assert "http" not in re.sub(r"base64,[^']+", "", text)
-    assert f"draft {comparison.fingerprint}" in text
+    assert f"{VERSION} {comparison.fingerprint}" in text
     assert [path.name for path in path.parent.iterdir()] == ["page.html"]
     (tmp_path / "file").touch()
     with pytest.raises(UsageError, match="cannot be written"):

@@ -58,11 +58,11 @@ def test_months_are_made_once_and_listed(capsys, folder: Path) -> None:
 
 
 def test_months_of_a_split_are_made_and_counted(capsys, monkeypatch) -> None:
-    monkeypatch.setattr(data, "GENERATED_SPLITS", {"generated-test": ("600000-00", "600001-07")})
-    assert main(["data", "make", "bus14", "--split", "generated-test", "--workers", "1"]) == 0
+    monkeypatch.setattr(data, "HELD_OUT_SPLITS", {"test": ("800000-00", "800001-07")})
+    assert main(["data", "make", "bus14", "--split", "test", "--workers", "1"]) == 0
     capsys.readouterr()
     main(["data", "list", "bus14"])
-    assert "generated-test 2/20" in capsys.readouterr().out
+    assert "test 2/20" in capsys.readouterr().out
 
 
 def test_an_interrupted_making_goes_on(capsys, monkeypatch) -> None:
@@ -130,8 +130,8 @@ def test_a_bad_folder_is_named_by_file_column_and_row(capsys, folder: Path, file
         (["make", "bus14", "--seed", "1", "--months", "june"], "numbers from 0 to 11"),
         (["make", "bus14", "--seed", "1", "--months", "4-3"], "numbers from 0 to 11"),
         (["make", "bus14", "--seed", "1", "--workers", "0"], "at least 1 process"),
-        (["make", "bus14", "--split", "train"], "choose from 'generated-validation', 'generated-test'"),
-        (["make", "bus14", "--split", "generated-test", "--months", "3"], "leave --months out"),
+        (["make", "bus14", "--split", "train"], "choose from 'validation', 'test'"),
+        (["make", "bus14", "--split", "test", "--months", "3"], "leave --months out"),
         (["import", "bus14", "nowhere"], "There is no scenario folder"),
         (["export", "bus14", "bundled/9", "mine"], "choose one of bundled/0000"),
         (["export", "bus14", "generated/7", "mine"], "must look like 17-03"),
@@ -176,6 +176,32 @@ def test_a_check_writes_a_page(capsys) -> None:
     output = capsys.readouterr().out
     assert "Largest loading of a line" in output
     assert Path("reports/scenarios-bus14.html").stat().st_size > 100_000
+
+
+def test_damaged_copies_are_found_and_removed(capsys, folder: Path) -> None:
+    load_scenario("bus14", "bundled/0000")
+    (copy,) = folder.glob("series/v1/bus14/bundled.0000-*.npy")
+    with copy.open("r+b") as stream:
+        stream.seek(-1, 2)
+        stream.write(b"\x55")
+    assert main(["data", "list", "bus14"]) == 0
+    assert f"Removed {copy}, which was damaged" in capsys.readouterr().out
+    assert not copy.exists()
+    assert main(["data", "list", "bus14"]) == 0
+    assert "Removed" not in capsys.readouterr().out
+
+
+def test_progress_shows_rate_and_time_left(capsys) -> None:
+    assert main(["data", "export", "bus14", "bundled/0000", "mine"]) == 0
+    shown = capsys.readouterr().err
+    assert "Writing mine" in shown
+    assert "100%" in shown
+    assert "values/s" in shown
+    assert "0:00:00" in shown
+    assert main(["data", "import", "bus14", "mine"]) == 0
+    shown = capsys.readouterr().err
+    assert "Reading mine" in shown
+    assert "/s" in shown
 
 
 def test_without_an_action_help_is_shown(capsys) -> None:

@@ -132,6 +132,7 @@ class FakeGrid(gymnasium.Env[Any, Any]):
         return {
             "scenario": self._scenario,
             "start": self._start,
+            "start_redraws": 0,
             "step": self._step,
             "episode_length": LENGTH,
             "survival": (self._step - self._lost()) / LENGTH,

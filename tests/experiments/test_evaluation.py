@@ -29,6 +29,7 @@ from rl2grid.experiments.episode import play_episode
 from rl2grid.experiments.evaluation import PARTIAL_FILE, evaluate, run_evaluation, validator
 from rl2grid.experiments.players import Job, Setting
 from rl2grid.experiments.runs import hyperparameters
+from rl2grid.scenarios.generated import VERSION
 from rl2grid.scenarios.library import list_scenarios
 
 FAKE = "fake_grid:FakeGrid-v0"
@@ -262,7 +263,8 @@ def test_bus14_rows_agree_with_the_environment(tmp_path, engine):
     assert len(result.episodes) == 2 * result.summary.scenarios
     assert result.identity["task"] == "rl2grid/bus14-T0-v0"
     assert result.identity["engine"] == engine == result.episodes[0].engine
-    assert len(result.identity["scenario_pack_hash"]) == len(result.identity["action_set_hash"]) == 16
+    assert result.identity["scenario_pack_hash"].startswith(f"{VERSION}-")
+    assert len(result.identity["action_set_hash"]) == 16
     for episode in result.episodes:
         assert episode.return_survive == episode.grid_steps - (not episode.completed)
         assert 0 <= episode.survival <= 1

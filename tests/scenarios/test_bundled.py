@@ -146,7 +146,7 @@ def test_arrays_are_mapped_and_read_only() -> None:
 def test_neither_grid2op_nor_pandas_is_imported() -> None:
     code = (
         "import sys; from rl2grid.scenarios.episodes import plan_episode; from rl2grid.grids import load_grid; "
-        "plan_episode(load_grid('bus14'), 'train', 0, 0); "
+        "plan_episode(load_grid('bus14'), 'bundled', 0, 0); "
         "print([name for name in ('grid2op', 'pandas', 'torch', 'numba') if name in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

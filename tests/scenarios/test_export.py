@@ -141,3 +141,19 @@ def test_names_that_no_id_can_hold_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="rename it without brackets"):
         import_folder(BUS14, folder)
     assert list_scenarios("bus14", "bundled")
+
+
+def test_progress_is_told_to_the_end(tmp_path: Path) -> None:
+    scenario = load_scenario("bus14", "bundled/rte_case14_redisp/0[0:5000]")
+    written: list[tuple[int, int]] = []
+    folder = export_scenario(BUS14, scenario, tmp_path / "told", lambda *told: written.append(told))
+    read: list[tuple[int, int]] = []
+    import_folder(BUS14, folder, lambda *told: read.append(told))
+    for told in (written, read):
+        assert len({total for _, total in told}) == 1
+        done = [each for each, _ in told]
+        assert done == sorted(done)
+        assert len(done) >= 3 * len(scenario.arrays())
+    assert written[-1][0] == written[-1][1] == sum(array.size for array in scenario.arrays().values())
+    infos = sum(file.stat().st_size for file in folder.glob("*.info"))
+    assert read[-1][0] == read[-1][1] - infos

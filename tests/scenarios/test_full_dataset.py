@@ -1,6 +1,7 @@
 """The full datasets of Grid2Op, played where the user has them and asks for them."""
 
 import shutil
+from datetime import datetime, timedelta
 from pathlib import Path
 
 import numpy as np
@@ -8,9 +9,11 @@ import pytest
 
 from rl2grid.errors import UsageError
 from rl2grid.grids import load_grid
+from rl2grid.scenarios import full
 from rl2grid.scenarios.bundled import bundled_folders
 from rl2grid.scenarios.episodes import plan_episode
 from rl2grid.scenarios.library import list_scenarios, load_scenario, scenario_pack_hash
+from rl2grid.scenarios.scenario import STEP
 
 PARTS = ("train", "validation", "test")
 
@@ -79,3 +82,110 @@ def test_the_pack_hash_is_that_of_the_full_split(full_data: Path, monkeypatch: p
     full = scenario_pack_hash("bus14", "test")
     monkeypatch.delenv("RL2GRID_FULL_DATA")
     assert scenario_pack_hash("bus14", "test") != full
+
+
+WEEK_ROWS = 2016
+FIRST_MONDAY = datetime(2050, 1, 3)
+
+
+def write_week(folder: Path, start: datetime, rows: int, first: int) -> None:
+    """A scenario folder of bus14, each of whose rows shows its number, counted from ``first``."""
+    folder.mkdir(parents=True)
+    grid = load_grid("bus14")
+    number = np.arange(first, first + rows)[:, np.newaxis] / 1000
+    for name, names, scale in (
+        ("load_p", grid.name_load, 1),
+        ("load_q", grid.name_load, 0.7),
+        ("prod_p", grid.name_gen, 2),
+    ):
+        table = np.broadcast_to(scale * number, (rows, len(names)))
+        for suffix, shift in (("", 0), ("_forecasted", 0.001)):
+            np.savetxt(folder / f"{name}{suffix}.csv", table + shift, "%.4f", ";", header=";".join(names), comments="")
+    (folder / "start_datetime.info").write_text(f"{start - STEP:%Y-%m-%d %H:%M}\n")
+
+
+def name_of(week: int, seed: int) -> str:
+    return f"{FIRST_MONDAY + week * timedelta(weeks=1):%Y-%m-%d}_{seed}"
+
+
+@pytest.fixture
+def weekly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Writes weeks 0, 1, ... of 2050 as Grid2Op names them."""
+
+    def write(*weeks: int, seed: int = 31, rows: int = WEEK_ROWS) -> None:
+        for week in weeks:
+            folder = tmp_path / "l2rpn_case14_sandbox" / "chronics" / name_of(week, seed)
+            write_week(folder, FIRST_MONDAY + week * timedelta(weeks=1), rows, week * WEEK_ROWS)
+
+    monkeypatch.setenv("RL2GRID_FULL_DATA", str(tmp_path))
+    full._folders.cache_clear()
+    return write
+
+
+def listed() -> list[str]:
+    return sorted(name for part in PARTS for name in _list(part))
+
+
+def _list(part: str) -> tuple[str, ...]:
+    try:
+        return list_scenarios("bus14", part)
+    except UsageError:
+        return ()
+
+
+@pytest.mark.parametrize("rows", [WEEK_ROWS, WEEK_ROWS + 1])
+def test_four_weeks_are_a_month(weekly, rows: int) -> None:
+    weekly(0, 1, 2, 3, rows=rows)
+    assert listed() == ["full/2050-01-03_31-4weeks"]
+    scenario = load_scenario("bus14", "full/2050-01-03_31-4weeks")
+    assert scenario.start_datetime == FIRST_MONDAY - STEP
+    assert scenario.n_rows == 3 * WEEK_ROWS + rows
+    expected = np.arange(scenario.n_rows) / 1000
+    np.testing.assert_allclose(scenario.load_p[:, 0], expected, atol=1e-4)
+    np.testing.assert_allclose(scenario.prod_p[:, -1], 2 * expected, atol=1e-4)
+    np.testing.assert_allclose(scenario.load_p_forecast[:, 0, 0], expected + 0.001, atol=1e-4)
+
+
+def test_weeks_that_do_not_join_stay_weeks(weekly) -> None:
+    weekly(0, 1, 2, 3)
+    weekly(4, 5, 7)
+    weekly(3, 4, 5, 6, seed=7)
+    assert listed() == sorted(
+        [
+            "full/2050-01-03_31-4weeks",
+            *(f"full/{name_of(week, 31)}" for week in (4, 5, 7)),
+            *(f"full/{name_of(week, 7)}" for week in (3, 4, 5, 6)),
+        ]
+    )
+    assert load_scenario("bus14", f"full/{name_of(5, 31)}").n_rows == WEEK_ROWS
+
+
+def test_weeks_whose_time_stamps_do_not_follow_each_other_stay_weeks(weekly, tmp_path: Path) -> None:
+    weekly(0, 1, 2, 3)
+    info = tmp_path / "l2rpn_case14_sandbox" / "chronics" / name_of(2, 31) / "start_datetime.info"
+    info.write_text("2050-01-16 23:50\n")
+    full._folders.cache_clear()
+    assert len(listed()) == 4
+
+
+def test_a_month_is_in_the_split_of_its_weeks(weekly, tmp_path: Path) -> None:
+    names = ["-".join(("full/" + name_of(4 * month, seed), "4weeks")) for month in range(3) for seed in range(10)]
+    assert {full._split_of(name) for name in names} == set(PARTS)
+    for month in range(3):
+        for seed in range(10):
+            weeks = {full._split_of(name_of(4 * month + week, seed)) for week in range(4)}
+            assert weeks == {full._split_of(name_of(4 * month, seed) + "-4weeks")}
+
+
+def test_numbered_weeks_are_joined_too() -> None:
+    names = [f"Scenario_{month}_wk{week}" for month in ("april_17", "august_21") for week in range(4)]
+    assert len({full._week_of(name).month for name in names}) == 2
+    for name in ("Scenario_april_000", "0001", "2050-01-03", "2050-13-03_1", "2019-01-12"):
+        assert full._week_of(name) is None
+
+
+def test_a_week_of_other_length_is_named(weekly) -> None:
+    weekly(0, 2, 3)
+    weekly(1, rows=1000)
+    with pytest.raises(UsageError, match=r"2050-01-10_31 has 1,000 rows: 2,016, or one more, are needed"):
+        load_scenario("bus14", "full/2050-01-03_31-4weeks")

@@ -12,13 +12,13 @@ import pytest
 
 import rl2grid  # noqa: F401  (registers the tasks)
 from rl2grid.errors import UsageError
-from rl2grid.grids import GRID_IDS, load_grid
+from rl2grid.grids import load_grid
 from rl2grid.scenarios import generated, library
 from rl2grid.scenarios.cache import data_folder
 from rl2grid.scenarios.episodes import MAX_STEPS, EpisodePlan, maintenance_matrix, plan_episode
 from rl2grid.scenarios.generator import month as generator
-from rl2grid.scenarios.library import list_scenarios, load_scenario, scenario_pack_hash
-from rl2grid.scenarios.splits import FIRST_TRAINING_SEED, GENERATED_SPLITS, GENERATED_TRAINING, TRAINING_SEEDS
+from rl2grid.scenarios.library import load_scenario
+from rl2grid.scenarios.splits import FIRST_TRAINING_SEED, HELD_OUT_SPLITS, TRAINING_SEEDS
 
 BUS14 = load_grid("bus14")
 MONTH_STEPS = 8064
@@ -156,31 +156,14 @@ def test_names_of_nothing_are_refused(name: str) -> None:
         load_scenario("bus14", f"generated/{name}")
 
 
-def test_held_out_months_are_of_other_years_in_all_seasons() -> None:
-    months = {split: [generated.parse_months(name) for name in names] for split, names in GENERATED_SPLITS.items()}
-    assert months.keys() == {"generated-validation", "generated-test"}
-    seeds = [each.seed for split in months.values() for each in split]
-    assert len(set(seeds)) == len(seeds) == 40
-    assert max(seeds) < FIRST_TRAINING_SEED
-    for split in months.values():
-        assert {each.first for each in split} == set(range(12))
-        per_season = np.bincount([each.first // 3 for each in split], minlength=4)
-        assert per_season.min() >= 4
-        assert all(each.n_months == 1 for each in split)
-
-
-def test_training_never_draws_a_held_out_month() -> None:
+def test_training_draws_years_from_its_own_range() -> None:
     drawn = [
         generated.parse_months(generated.draw_training_months(seed, number))
         for seed in range(500)
         for number in range(40)
     ]
-    held_out = {generated.parse_months(name).seed for names in GENERATED_SPLITS.values() for name in names}
-    assert not held_out & {each.seed for each in drawn}
     assert all(generated.is_training_seed(each.seed) for each in drawn)
-    assert not any(generated.is_training_seed(seed) for seed in held_out)
     assert FIRST_TRAINING_SEED + TRAINING_SEEDS <= 2**63
-    # Also by construction: no draw of the stream reaches a seed below the range.
     assert generated.is_training_seed(FIRST_TRAINING_SEED)
     assert not generated.is_training_seed(FIRST_TRAINING_SEED - 1)
     counts = np.bincount([each.first for each in drawn], minlength=12)
@@ -188,21 +171,27 @@ def test_training_never_draws_a_held_out_month() -> None:
     np.testing.assert_allclose(counts[:11] / len(drawn), 1 / 11, atol=0.01)
 
 
-def test_twelve_episodes_in_a_row_are_of_one_year() -> None:
-    seeds = [generated.parse_months(generated.draw_training_months(5, number)).seed for number in range(36)]
-    assert [len(set(seeds[first : first + 12])) for first in (0, 12, 24)] == [1, 1, 1]
-    assert len(set(seeds)) == 3
-    assert generated.draw_training_months(6, 0) != generated.draw_training_months(5, 0)
+def test_episodes_in_a_row_and_neighbouring_seeds_play_one_year() -> None:
+    years = np.array(
+        [
+            [generated.parse_months(generated.draw_training_months(seed, number)).seed for number in range(36)]
+            for seed in range(48)
+        ]
+    )
+    blocks = years.reshape(3, 16, 3, 12)
+    assert (blocks == blocks[:, :1, :, :1]).all()
+    assert len(np.unique(years)) == 9
+    assert len({generated.draw_training_months(seed, 0) for seed in range(16)}) > 4
 
 
 def test_training_plans_start_anywhere_and_go_on_in_the_next_month(made) -> None:
-    plans = [plan_episode(BUS14, GENERATED_TRAINING, 5, number) for number in range(12)]
-    assert plans == [plan_episode(BUS14, GENERATED_TRAINING, 5, number) for number in range(12)]
+    plans = [plan_episode(BUS14, "train", 5, number) for number in range(12)]
+    assert plans == [plan_episode(BUS14, "train", 5, number) for number in range(12)]
     assert all(plan.n_steps == MAX_STEPS and 0 <= plan.start < MONTH_STEPS for plan in plans)
     starts = [plan.start for plan in plans]
     assert len(set(starts)) == 12
     assert max(starts) > MONTH_STEPS / 2 > min(starts)
-    chosen = plan_episode(BUS14, GENERATED_TRAINING, 5, 0, start=7)
+    chosen = plan_episode(BUS14, "train", 5, 0, start=7)
     assert (chosen.scenario_id, chosen.start) == (plans[0].scenario_id, 7)
     scenario = load_scenario("bus14", plans[0].scenario_id)
     assert maintenance_matrix(BUS14, scenario, plans[0]).shape == (2 * MONTH_STEPS + 1, BUS14.n_line)
@@ -218,47 +207,6 @@ def test_generated_months_have_outages_on_grids_whose_series_record_them() -> No
     assert lines.any()
 
 
-def test_held_out_plans_enumerate_whole_months(made) -> None:
-    for split, names in GENERATED_SPLITS.items():
-        plan = plan_episode(BUS14, split, 0, 1)
-        assert (plan.scenario_id, plan.start, plan.n_steps) == (f"generated/{names[1]}", 0, MAX_STEPS)
-
-
-@pytest.mark.parametrize("split", GENERATED_SPLITS)
-def test_held_out_months_are_refused_in_training(split: str) -> None:
-    for name in GENERATED_SPLITS[split]:
-        with pytest.raises(
-            UsageError, match="not in the split generated-train of bus14: choose one such as generated/"
-        ):
-            plan_episode(BUS14, GENERATED_TRAINING, 0, 0, scenario=f"generated/{name}")
-    with pytest.raises(UsageError, match="not in the split"):
-        plan_episode(BUS14, split, 0, 0, scenario=f"generated/{FIRST_TRAINING_SEED}-03")
-    with pytest.raises(UsageError, match="not in the split generated-train"):
-        plan_episode(BUS14, GENERATED_TRAINING, 0, 0, scenario="bundled/0000")
-
-
-@pytest.mark.parametrize("grid_id", GRID_IDS)
-def test_splits_of_generated_months_are_listed_where_they_end(grid_id: str) -> None:
-    for split, names in GENERATED_SPLITS.items():
-        assert list_scenarios(grid_id, split) == tuple(f"generated/{name}" for name in names)
-    with pytest.raises(UsageError, match="has no end, and its months cannot be listed: choose one of train, "):
-        list_scenarios(grid_id, GENERATED_TRAINING)
-
-
-def test_results_name_the_generator(made, monkeypatch) -> None:
-    few = {split: names[:2] for split, names in GENERATED_SPLITS.items()}
-    monkeypatch.setattr(library, "GENERATED_SPLITS", few)
-    hashes = [scenario_pack_hash("bus14", split) for split in (*few, GENERATED_TRAINING)]
-    assert hashes == [scenario_pack_hash("bus14", split) for split in (*few, GENERATED_TRAINING)]
-    assert len(set(hashes)) == 3
-    for text in hashes:
-        version, _, digest = text.rpartition("-")
-        assert version == generated.VERSION
-        assert len(digest) == 16
-    assert [library.generator_version(split) for split in library.RECORDED_SPLITS] == [None] * 4
-    assert {library.generator_version(split) for split in (*few, GENERATED_TRAINING)} == {generated.VERSION}
-
-
 def test_an_unwritable_data_folder_is_named(tmp_path: Path, monkeypatch) -> None:
     (tmp_path / "file").touch()
     monkeypatch.setenv("RL2GRID_DATA", str(tmp_path / "file"))
@@ -269,12 +217,10 @@ def test_an_unwritable_data_folder_is_named(tmp_path: Path, monkeypatch) -> None
 def test_both_engines_play_the_same_month(made) -> None:
     played = {}
     for engine in ("native", "reference"):
-        env = gymnasium.make(
-            "rl2grid/bus14-T0-v0", engine=engine, split="generated-validation", heuristic=None, opponent=False
-        )
+        env = gymnasium.make("rl2grid/bus14-T0-v0", engine=engine, split="validation", heuristic=None, opponent=False)
         observations = [env.reset(seed=0)[0]] + [env.step(0)[0] for _ in range(30)]
         played[engine] = np.array(observations)
         env.close()
-    assert made == [generated.parse_months(GENERATED_SPLITS["generated-validation"][0])[:2]]
+    assert made == [generated.parse_months(HELD_OUT_SPLITS["validation"][0])[:2]]
     np.testing.assert_allclose(played["native"], played["reference"], rtol=1e-4, atol=1e-4)
     assert np.ptp(played["native"], axis=0).any()

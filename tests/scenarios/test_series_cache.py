@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from rl2grid.errors import UsageError
-from rl2grid.scenarios.cache import CachedSeries, cached_series
+from rl2grid.scenarios import cache
+from rl2grid.scenarios.cache import CachedSeries, cached_series, remove_damaged
 from rl2grid.scenarios.folder import FolderContent
 
 START = datetime(2019, 1, 5, 23, 55)
@@ -136,3 +137,101 @@ def test_the_manifest_describes_every_array(folder: Path, tmp_path: Path) -> Non
     record = json.loads(path.read_text())
     assert record["arrays"]["load_p_forecast"] == {"dtype": "<f4", "offset": 128, "shape": [10, 1, 3]}
     assert record["start_datetime"] == "2019-01-05T23:55:00"
+
+
+@pytest.fixture
+def hashed(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+    """Files whose values were hashed since, where every file counts as settled."""
+    files: list[Path] = []
+    is_sound = cache._is_sound
+
+    def counted(data: Path, record: dict) -> bool:
+        files.append(data)
+        return is_sound(data, record)
+
+    monkeypatch.setattr(cache, "_is_sound", counted)
+    monkeypatch.setattr(cache, "_SETTLED", 0)
+    return files
+
+
+def test_values_are_hashed_again_only_where_the_file_has_changed(folder: Path, tmp_path: Path, hashed: list) -> None:
+    first = load(tmp_path / "log")
+    for expected in (1, 1, 1):
+        assert load(tmp_path / "log").content_hash == first.content_hash
+        assert len(hashed) == expected
+    (data,) = folder.glob("*.npy")
+    os.utime(data)
+    for _ in range(2):
+        load(tmp_path / "log")
+        assert len(hashed) == 2
+    assert (tmp_path / "log").read_text() == "built\n"
+    assert len(list(folder.iterdir())) == 3
+
+
+@pytest.mark.parametrize("keep_time", [False, True])
+def test_a_changed_value_is_found_after_the_copy_was_hashed(
+    folder: Path, tmp_path: Path, hashed: list, keep_time: bool
+) -> None:
+    load(tmp_path / "log")
+    load(tmp_path / "log")
+    (data,) = folder.glob("*.npy")
+    before = data.stat()
+    with data.open("r+b") as stream:
+        stream.seek(-3, os.SEEK_END)
+        stream.write(b"\x07")
+    if keep_time:
+        os.utime(data, ns=(before.st_atime_ns, before.st_mtime_ns))
+    series = load(tmp_path / "log")
+    assert (tmp_path / "log").read_text() == "built\nbuilt\n"
+    np.testing.assert_array_equal(series.arrays["load_p"], content().arrays["load_p"])
+
+
+def test_a_file_that_has_just_changed_is_not_trusted(folder: Path, tmp_path: Path, hashed: list, monkeypatch) -> None:
+    monkeypatch.setattr(cache, "_SETTLED", 60 * 10**9)
+    for _ in range(3):
+        load(tmp_path / "log")
+    assert len(hashed) == 2
+
+
+def test_what_changes_no_time_is_found_by_looking_at_every_copy(
+    folder: Path, tmp_path: Path, hashed: list, monkeypatch
+) -> None:
+    monkeypatch.setattr(cache, "_status", lambda data: [1, 2, 3, 4])
+    load(tmp_path / "log")
+    load(tmp_path / "log")
+    cached_series("bus14", "sound", "f" * 20, content)
+    (data,) = folder.glob("mix*.npy")
+    raw = bytearray(data.read_bytes())
+    raw[-3] ^= 1
+    data.write_bytes(raw)
+    load(tmp_path / "log")
+    assert (tmp_path / "log").read_text() == "built\n"
+    assert remove_damaged("bus14") == [data]
+    assert remove_damaged("bus14") == []
+    assert [path.name for path in folder.glob("*.npy")] == ["sound-ffffffffffffffff.npy"]
+    load(tmp_path / "log")
+    assert (tmp_path / "log").read_text() == "built\nbuilt\n"
+
+
+@pytest.mark.parametrize("edit", [('"offset": 128', '"offset": 64'), ("23:55", "23:50"), ("<f4", "<i4")])
+def test_every_entry_of_the_manifest_counts(folder: Path, tmp_path: Path, hashed: list, edit: tuple[str, str]) -> None:
+    before = load(tmp_path / "log").content_hash
+    (manifest,) = folder.glob("*.json")
+    assert edit[0] in manifest.read_text()
+    manifest.write_text(manifest.read_text().replace(*edit))
+    assert load(tmp_path / "log").content_hash == before
+    assert (tmp_path / "log").read_text() == "built\nbuilt\n"
+
+
+def test_a_folder_that_is_only_read_is_hashed_every_time(
+    folder: Path, tmp_path: Path, hashed: list, monkeypatch
+) -> None:
+    load(tmp_path / "log")
+
+    def refused(path: Path, text: str) -> None:
+        raise PermissionError(path)
+
+    monkeypatch.setattr(Path, "write_text", refused)
+    for expected in (1, 2):
+        load(tmp_path / "log")
+        assert len(hashed) == expected

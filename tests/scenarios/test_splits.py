@@ -3,60 +3,72 @@
 import numpy as np
 import pytest
 
-from rl2grid.grids import GRID_IDS
-from rl2grid.scenarios.library import list_scenarios, load_scenario
-from rl2grid.scenarios.scenario import Scenario
+from rl2grid.errors import UsageError
+from rl2grid.grids import GRID_IDS, load_grid
+from rl2grid.scenarios import generated, library
+from rl2grid.scenarios.episodes import MAX_STEPS, plan_episode
+from rl2grid.scenarios.library import generator_version, list_scenarios, scenario_pack_hash
+from rl2grid.scenarios.splits import FIRST_TRAINING_SEED, HELD_OUT_SPLITS, SPLITS
 
-PARTS = ("train", "validation", "test")
+BUS14 = load_grid("bus14")
+HELD_OUT = ("validation", "test")
 
 
-def rows_of(scenario: Scenario) -> set[tuple[str, int]]:
-    name = scenario.id.partition("[")[0]
-    return {(name, row) for row in range(scenario.first_row, scenario.first_row + scenario.n_rows)}
+def test_held_out_months_are_of_other_years_in_all_seasons() -> None:
+    months = {split: [generated.parse_months(name) for name in names] for split, names in HELD_OUT_SPLITS.items()}
+    assert tuple(months) == HELD_OUT
+    seeds = [each.seed for split in months.values() for each in split]
+    assert len(set(seeds)) == len(seeds) == 40
+    assert max(seeds) < FIRST_TRAINING_SEED
+    assert not any(map(generated.is_training_seed, seeds))
+    for split in months.values():
+        assert {each.first for each in split} == set(range(12))
+        per_season = np.bincount([each.first // 3 for each in split], minlength=4)
+        assert per_season.min() >= 4
+        assert all(each.n_months == 1 for each in split)
 
 
 @pytest.mark.parametrize("grid_id", GRID_IDS)
-def test_every_row_is_in_exactly_one_split(grid_id: str) -> None:
-    windows = [load_scenario(grid_id, scenario_id) for part in PARTS for scenario_id in list_scenarios(grid_id, part)]
-    whole = [load_scenario(grid_id, scenario_id) for scenario_id in list_scenarios(grid_id, "bundled")]
-    assert sum(window.n_rows for window in windows) == sum(series.n_rows for series in whole)
-    assert set().union(*map(rows_of, windows)) == set().union(*map(rows_of, whole))
+def test_splits_are_listed_where_they_end(grid_id: str) -> None:
+    for split in HELD_OUT:
+        assert list_scenarios(grid_id, split) == tuple(f"generated/{name}" for name in HELD_OUT_SPLITS[split])
+    with pytest.raises(UsageError, match="has no end, and its months cannot be listed: choose one of validation, "):
+        list_scenarios(grid_id, "train")
 
 
-@pytest.mark.parametrize("grid_id", GRID_IDS)
-def test_no_demand_of_one_split_is_in_another(grid_id: str) -> None:
-    """Also where two series of different names hold the same demand."""
-    demand = {
-        part: {
-            row.tobytes()
-            for scenario_id in list_scenarios(grid_id, part)
-            for row in np.hstack([getattr(load_scenario(grid_id, scenario_id), name) for name in ("load_p", "load_q")])
-        }
-        for part in PARTS
-    }
-    assert not demand["train"] & demand["test"]
-    assert not demand["train"] & demand["validation"]
-    assert not demand["validation"] & demand["test"]
+@pytest.mark.parametrize("split", HELD_OUT)
+def test_held_out_months_are_refused_in_training(split: str) -> None:
+    for name in HELD_OUT_SPLITS[split]:
+        for window in ("", "[0:288]"):
+            with pytest.raises(UsageError, match="not in the split train of bus14: choose one such as generated/"):
+                plan_episode(BUS14, "train", 0, 0, scenario=f"generated/{name}{window}")
+    with pytest.raises(UsageError, match=f"not in the split {split} of bus14: choose one of generated/"):
+        plan_episode(BUS14, split, 0, 0, scenario=f"generated/{FIRST_TRAINING_SEED}-03")
+    with pytest.raises(UsageError, match="not in the split train"):
+        plan_episode(BUS14, "train", 0, 0, scenario="bundled/0000")
 
 
-def test_the_mixes_share_their_demand() -> None:
-    one, other = (load_scenario("bus118-M", f"bundled/{mix}/001") for mix in ("x1", "x2.5"))
-    assert np.array_equal(one.load_p, other.load_p)
-    assert not np.array_equal(one.prod_p, other.prod_p)
+@pytest.mark.parametrize("split", HELD_OUT)
+def test_held_out_plans_enumerate_whole_months(split: str) -> None:
+    plan = plan_episode(BUS14, split, 0, 1)
+    name = HELD_OUT_SPLITS[split][1]
+    assert (plan.scenario_id, plan.start, plan.n_steps) == (f"generated/{name}", 0, MAX_STEPS)
 
 
-def test_bus14_has_real_months_on_both_sides() -> None:
-    months = [name for name in list_scenarios("bus14", "bundled") if load_scenario("bus14", name).n_steps == 8064]
-    assert len(months) == 4
-    assert set(months) & set(list_scenarios("bus14", "train"))
-    assert set(months) & set(list_scenarios("bus14", "test"))
-    assert sum(load_scenario("bus14", name).n_rows for name in list_scenarios("bus14", "validation")) >= 7 * 288
+def test_a_window_of_a_listed_scenario_may_be_played() -> None:
+    scenario = f"{list_scenarios('bus14', 'validation')[0]}[100:400]"
+    assert plan_episode(BUS14, "validation", 0, 0, scenario=scenario).n_steps == 299
 
 
-@pytest.mark.parametrize("grid_id", ["bus36-M", "bus118-MOB-v0"])
-def test_a_single_series_is_cut_at_two_thirds(grid_id: str) -> None:
-    (test,) = (load_scenario(grid_id, name) for name in list_scenarios(grid_id, "test"))
-    (validation,) = (load_scenario(grid_id, name) for name in list_scenarios(grid_id, "validation"))
-    assert test.first_row + test.n_rows == test.series_rows
-    assert test.first_row == pytest.approx(test.series_rows * 2 / 3, abs=1)
-    assert validation.first_row == pytest.approx(test.first_row * 3 / 4, abs=1)
+def test_results_name_the_generator_and_what_was_played(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(library, "HELD_OUT_SPLITS", {split: names[:2] for split, names in HELD_OUT_SPLITS.items()})
+    hashes = [scenario_pack_hash("bus14", split) for split in SPLITS]
+    assert hashes == [scenario_pack_hash("bus14", split) for split in SPLITS]
+    assert len(set(hashes)) == 4
+    first = list_scenarios("bus14", "validation")[:1]
+    assert scenario_pack_hash("bus14", "validation", first) not in hashes
+    for split, text in zip(SPLITS, hashes, strict=True):
+        version, _, digest = text.rpartition("-")
+        assert version == ("" if split == "bundled" else generated.VERSION)
+        assert len(digest) == 16
+        assert generator_version(split) == (version or None)

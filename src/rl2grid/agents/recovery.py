@@ -26,7 +26,7 @@ class Recovery:
     name = "recovery"
 
     def bind(self, env: gymnasium.Env[Any, Any]) -> None:
-        """Index the actions of the task, and listen to its grid steps: observations may be scaled.
+        """Index the actions of the task, and remember the environment, whose state is looked at.
 
         Raises:
             UsageError: the task has no topology actions.
@@ -37,7 +37,7 @@ class Recovery:
                 "choose a topology task (-T0-, -T1-, ...) or the keyword heuristic='recovery'."
             )
         base: Any = env.unwrapped
-        base.step_listeners.append(self._hear)
+        self._env = base
         actions = full_catalogue(base.grid).take(base.action_catalogue_ids)
         keys = zip(actions.kind.tolist(), actions.target.tolist(), actions.mask.tolist(), strict=True)
         self._action = {key: action for action, key in enumerate(keys)}
@@ -47,23 +47,20 @@ class Recovery:
 
     def act(self, observation: Observation, info: Info) -> Action:
         """The id of the heuristic's action, 0 where it would idle or the task lacks that action."""
-        state, row = self._state, self._row
-        if not is_safe(state, row):
+        state: GridState = self._env.state
+        if not is_safe(state, 0):
             return _NOTHING
-        kind, target = recovery_action(state, row)
+        kind, target = recovery_action(state, 0)
         if kind == ActionKind.RECONNECT:
             return self._action.get((int(ActionKind.SWITCH), int(target), 0), _NOTHING)
         if kind == ActionKind.RESTORE:
-            mask = _on_second_busbar(state, row, int(target))
+            mask = _on_second_busbar(state, int(target))
             return self._action.get((int(ActionKind.MOVE), int(target), mask), _NOTHING)
         return _NOTHING
 
-    def _hear(self, state: GridState, row: int) -> None:
-        self._state, self._row = state, row
 
-
-def _on_second_busbar(state: GridState, row: int, sub: int) -> int:
+def _on_second_busbar(state: GridState, sub: int) -> int:
     """The elements of a substation that sit on busbar 2, as the mask of a move."""
     first, size = int(state.sub_first_element[sub]), int(state.sub_info[sub])
-    busbars = state.topo_vect[row, first : first + size]
+    busbars = state.topo_vect[0, first : first + size]
     return int(sum(1 << k for k in np.flatnonzero(busbars == 2).tolist()))

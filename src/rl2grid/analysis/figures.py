@@ -95,7 +95,7 @@ def training_curves(
         theme: colours.
         title: of the figure.
     """
-    with matplotlib.rc_context(_style(theme)):
+    with matplotlib.rc_context(style(theme)):
         figure = Figure(figsize=(6.4, 3.6), layout="constrained")
         axes = figure.subplots()
         labels = list(dict.fromkeys(curve.label for curve in curves))
@@ -121,7 +121,7 @@ def survival_by_agent(
 ) -> Figure:
     """Every episode as a dot, the mean with its 95% interval, and both in numbers; the best agent on top."""
     ranked = sorted(results, key=lambda result: result.summary.survival.value)
-    with matplotlib.rc_context(_style(theme)):
+    with matplotlib.rc_context(style(theme)):
         figure = Figure(figsize=(6.4, 1.35 + 0.62 * len(ranked)), layout="constrained")
         axes = figure.subplots()
         for row, result in enumerate(ranked):
@@ -147,7 +147,7 @@ def episode_loading(recording: Recording, *, theme: Theme = LIGHT) -> Figure:
     Lines are ordered by their loading, the most loaded on top.
     """
     n_line = len(recording.line_names)
-    with matplotlib.rc_context(_style(theme)):
+    with matplotlib.rc_context(style(theme)):
         height = float(np.clip(0.13 * n_line, 2.2, 7.0))
         figure = Figure(figsize=(8.4, height + 2.5), layout="constrained")
         peak, heat, marks = figure.subplots(
@@ -187,6 +187,53 @@ def save_figure(figure: Figure, path: Path, *, formats: Sequence[str] = ("png", 
 def png_bytes(figure: Figure) -> bytes:
     """A figure as PNG."""
     return _render(figure, "png")
+
+
+def style(theme: Theme) -> dict[str, Any]:
+    """Settings of Matplotlib for figures in a theme, for :func:`matplotlib.rc_context`."""
+    return {
+        "figure.facecolor": theme.background,
+        "axes.facecolor": theme.background,
+        "savefig.facecolor": theme.background,
+        "text.color": theme.text,
+        "axes.labelcolor": theme.text,
+        "axes.titlecolor": theme.text,
+        "xtick.color": theme.muted,
+        "ytick.color": theme.muted,
+        "xtick.labelcolor": theme.text,
+        "ytick.labelcolor": theme.text,
+        "axes.edgecolor": theme.muted,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.linewidth": 0.8,
+        "axes.axisbelow": True,
+        "grid.color": theme.rule,
+        "grid.linewidth": 0.8,
+        "font.family": "DejaVu Sans",
+        "font.size": 9,
+        "axes.labelsize": 9,
+        "xtick.labelsize": 8,
+        "ytick.labelsize": 8,
+        "legend.fontsize": 8,
+        "legend.frameon": True,
+        "legend.facecolor": theme.background,
+        "legend.edgecolor": theme.rule,
+        "legend.framealpha": 0.9,
+        "figure.constrained_layout.w_pad": 0.12,
+        "figure.constrained_layout.h_pad": 0.12,
+        "pdf.fonttype": 42,
+    }
+
+
+def loading_colours(theme: Theme) -> Colormap:
+    """Colours of loadings from 0 to :data:`FULL_SCALE`, which change at :data:`SAFE_LOADING`."""
+    """Up to the limit from empty to full, beyond it another hue: an overload is never a shade of normal."""
+    below = LinearSegmentedColormap.from_list("below", theme.loading)
+    above = LinearSegmentedColormap.from_list("above", ["#F28E2B", VERMILLION, "#A50F15"])
+    n = 300
+    limit = round(n * SAFE_LOADING / FULL_SCALE)
+    colours = [below(k / (limit - 1)) for k in range(limit)] + [above(k / (n - limit - 1)) for k in range(n - limit)]
+    return ListedColormap(colours).with_extremes(bad=theme.out, over="#7A0010")
 
 
 def _render(figure: Figure, suffix: str) -> bytes:
@@ -277,7 +324,7 @@ def _draw_heat(axes: Axes, recording: Recording, end: float, theme: Theme) -> tu
     extent = (0.0, max(end, 1e-9), len(order) - 0.5, -0.5)
     image = axes.imshow(
         loading,
-        cmap=_loading_colours(theme),
+        cmap=loading_colours(theme),
         norm=Normalize(0, FULL_SCALE),
         aspect="auto",
         extent=extent,
@@ -342,16 +389,6 @@ def _episode_words(recording: Recording) -> tuple[str, str]:
     )
 
 
-def _loading_colours(theme: Theme) -> Colormap:
-    """Up to the limit from empty to full, beyond it another hue: an overload is never a shade of normal."""
-    below = LinearSegmentedColormap.from_list("below", theme.loading)
-    above = LinearSegmentedColormap.from_list("above", ["#F28E2B", VERMILLION, "#A50F15"])
-    n = 300
-    limit = round(n * SAFE_LOADING / FULL_SCALE)
-    colours = [below(k / (limit - 1)) for k in range(limit)] + [above(k / (n - limit - 1)) for k in range(n - limit)]
-    return ListedColormap(colours).with_extremes(bad=theme.out, over="#7A0010")
-
-
 def _pools(n_steps: int) -> list[slice]:
     bounds = np.linspace(0, n_steps, min(n_steps, MAX_COLUMNS) + 1).astype(int)
     return [slice(int(first), int(last)) for first, last in itertools.pairwise(bounds)]
@@ -400,38 +437,3 @@ def _thousands(value: float, _: int | None) -> str:
     if value >= 1e6:
         return f"{value / 1e6:g}M"
     return f"{value / 1e3:g}k" if value >= 1e3 else f"{value:g}"
-
-
-def _style(theme: Theme) -> dict[str, Any]:
-    return {
-        "figure.facecolor": theme.background,
-        "axes.facecolor": theme.background,
-        "savefig.facecolor": theme.background,
-        "text.color": theme.text,
-        "axes.labelcolor": theme.text,
-        "axes.titlecolor": theme.text,
-        "xtick.color": theme.muted,
-        "ytick.color": theme.muted,
-        "xtick.labelcolor": theme.text,
-        "ytick.labelcolor": theme.text,
-        "axes.edgecolor": theme.muted,
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "axes.linewidth": 0.8,
-        "axes.axisbelow": True,
-        "grid.color": theme.rule,
-        "grid.linewidth": 0.8,
-        "font.family": "DejaVu Sans",
-        "font.size": 9,
-        "axes.labelsize": 9,
-        "xtick.labelsize": 8,
-        "ytick.labelsize": 8,
-        "legend.fontsize": 8,
-        "legend.frameon": True,
-        "legend.facecolor": theme.background,
-        "legend.edgecolor": theme.rule,
-        "legend.framealpha": 0.9,
-        "figure.constrained_layout.w_pad": 0.12,
-        "figure.constrained_layout.h_pad": 0.12,
-        "pdf.fonttype": 42,
-    }

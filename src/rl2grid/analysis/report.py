@@ -73,7 +73,8 @@ def write_report(
     for picture in pictures:
         light = picture.draw(LIGHT)
         figures.save_figure(light, folder / FIGURES_FOLDER / picture.name)
-        drawn.append(_figure_html(picture, figures.png_bytes(light), figures.png_bytes(picture.draw(DARK))))
+        dark = figures.png_bytes(picture.draw(DARK))
+        drawn.append(figure_html(picture.caption, figures.png_bytes(light), dark, picture.command))
     _write(folder / TABLE_FILE, f"# {title}\n\n{tables.markdown_table(summaries)}\n{tables.LEGEND}\n")
     body = [
         _header(title, introduction, summaries),
@@ -83,9 +84,37 @@ def write_report(
         _commands_html(results, commands),
         _identity_html(results),
     ]
-    page = _PAGE.replace("{title}", html.escape(title)).replace("{body}", "\n".join(body))
-    _write(folder / REPORT_FILE, page)
+    write_page(folder / REPORT_FILE, title, body)
     return folder / REPORT_FILE
+
+
+def write_page(path: Path, title: str, parts: Sequence[str]) -> None:
+    """Write one HTML page that needs no other file, in the place of an earlier one; ``parts`` are HTML."""
+    page = _PAGE.replace("{title}", html.escape(title)).replace("{body}", "\n".join(parts))
+    _write(path, page)
+
+
+def facts_html(facts: Sequence[tuple[str, str]]) -> str:
+    """Names and values as cards."""
+    cards = "".join(f"<div><dt>{html.escape(name)}</dt><dd>{html.escape(value)}</dd></div>" for name, value in facts)
+    return f"<dl class=facts>{cards}</dl>"
+
+
+def table_html(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table that scrolls sideways on narrow screens; the first two columns are words."""
+    head = "".join(f"<th>{html.escape(heading)}</th>" for heading in headings)
+    body = "".join(f"<tr>{''.join(f'<td>{html.escape(cell)}</td>' for cell in row)}</tr>" for row in rows)
+    return _scrolling(head, body)
+
+
+def figure_html(caption: str, light: bytes, dark: bytes, command: str = "") -> str:
+    """A figure, PNG in both themes, and below it what is to be seen and what made it."""
+    made = f"<code>{html.escape(command)}</code>" if command else ""
+    return (
+        f"<section><figure><picture><source media='(prefers-color-scheme: dark)' srcset='{_data_uri(dark)}'>"
+        f"<img src='{_data_uri(light)}' alt='{html.escape(caption, quote=True)}'></picture>"
+        f"<figcaption>{html.escape(caption)}{made}</figcaption></figure></section>"
+    )
 
 
 def _pictures(
@@ -133,9 +162,8 @@ def _header(title: str, introduction: str, summaries: Sequence[Summary]) -> str:
         ("by", best.agent + ("" if best.heuristic == "none" else f" + {best.heuristic}")),
         ("episodes per agent", str(first.episodes)),
     ]
-    cards = "".join(f"<div><dt>{html.escape(name)}</dt><dd>{html.escape(value)}</dd></div>" for name, value in facts)
     lead = f"<p>{html.escape(introduction)}</p>" if introduction else ""
-    return f"<header><h1>{html.escape(title)}</h1>{lead}<dl class=facts>{cards}</dl></header>"
+    return f"<header><h1>{html.escape(title)}</h1>{lead}{facts_html(facts)}</header>"
 
 
 def _table_html(summaries: Sequence[Summary]) -> str:
@@ -144,7 +172,11 @@ def _table_html(summaries: Sequence[Summary]) -> str:
     for summary in summaries:
         cells = "".join(f"<td>{_cell(cell)}</td>" for cell in tables.table_cells(summary))
         rows.append(f"<tr{' class=best' if tables.is_best(summary, summaries) else ''}>{cells}</tr>")
-    return f"<div class=scroll><table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table></div>"
+    return _scrolling(head, "".join(rows))
+
+
+def _scrolling(head: str, body: str) -> str:
+    return f"<div class=scroll><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
 
 
 def _cell(text: str) -> str:
@@ -153,31 +185,21 @@ def _cell(text: str) -> str:
     return f"{value}<small>[{interval}</small>" if bracket else value
 
 
-def _figure_html(picture: _Picture, light: bytes, dark: bytes) -> str:
-    command = f"<code>{html.escape(picture.command)}</code>" if picture.command else ""
-    return (
-        f"<section><figure><picture><source media='(prefers-color-scheme: dark)' srcset='{_data_uri(dark)}'>"
-        f"<img src='{_data_uri(light)}' alt='{html.escape(picture.caption, quote=True)}'></picture>"
-        f"<figcaption>{html.escape(picture.caption)}{command}</figcaption></figure></section>"
-    )
-
-
 def _endings_html(summaries: Sequence[Summary]) -> str:
     reasons = sorted({reason for summary in summaries for reason in summary.game_over})
     if not reasons:
         return ""
-    head = "".join(f"<th>{html.escape(reason.replace('_', ' ').lower())}</th>" for reason in reasons)
-    rows = "".join(
-        f"<tr><td>{html.escape(summary.agent)}</td><td>{html.escape(summary.heuristic)}</td>"
-        f"<td>{summary.episodes - sum(summary.game_over.values())}</td>"
-        + "".join(f"<td>{summary.game_over.get(reason, 0)}</td>" for reason in reasons)
-        + "</tr>"
+    headings = ("agent", "heuristic", "completed", *(reason.replace("_", " ").lower() for reason in reasons))
+    rows = [
+        (
+            summary.agent,
+            summary.heuristic,
+            str(summary.episodes - sum(summary.game_over.values())),
+            *(str(summary.game_over.get(reason, 0)) for reason in reasons),
+        )
         for summary in summaries
-    )
-    return (
-        "<section><h2>How episodes ended</h2><div class=scroll><table><thead><tr><th>agent</th><th>heuristic</th>"
-        f"<th>completed</th>{head}</tr></thead><tbody>{rows}</tbody></table></div></section>"
-    )
+    ]
+    return f"<section><h2>How episodes ended</h2>{table_html(headings, rows)}</section>"
 
 
 def _commands_html(results: Sequence[EvaluationResult], commands: Mapping[str, str]) -> str:

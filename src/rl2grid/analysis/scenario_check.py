@@ -6,13 +6,11 @@ flow is computed once an hour, in the reference topology, with everything in ser
 
 from __future__ import annotations
 
-import base64
 import html
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import matplotlib
 import numpy as np
@@ -22,7 +20,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.table import Table
 
-from rl2grid.analysis.figures import LIGHT, png_bytes
+from rl2grid.analysis import report
+from rl2grid.analysis.figures import DARK, LIGHT, Theme, png_bytes, style
 from rl2grid.errors import UsageError
 from rl2grid.grids import STEPS_PER_HOUR, Grid
 from rl2grid.scenarios.generated import MONTHS, VERSION, generator_fingerprint, month_name
@@ -216,13 +215,10 @@ def write_page(comparison: Comparison, path: Path) -> None:
         ("Autocorrelation: how much a value says about a later one.", _draw_correlations),
         ("The first week of a series of each source.", _draw_week),
     ]
-    body = "\n".join([_header(comparison), _table(comparison), *(_figure(comparison, *each) for each in pictures)])
-    title = html.escape(f"Generated and bundled series of {comparison.grid_id}")
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    parts = [_header(comparison), _table(comparison), *(_figure(comparison, *each) for each in pictures)]
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary.write_text(_PAGE.replace("{title}", title).replace("{body}", body), encoding="utf-8", newline="\n")
-        os.replace(temporary, path)
+        report.write_page(path, _title(comparison), parts)
     except OSError as error:
         raise UsageError(f"Page {path} cannot be written ({error}): choose another place.") from error
 
@@ -277,6 +273,10 @@ def _number(value: float) -> str:
     return "" if np.isnan(value) else f"{value:,.3g}" if abs(value) < 1000 else f"{value:,.0f}"
 
 
+def _title(comparison: Comparison) -> str:
+    return f"Generated and bundled series of {comparison.grid_id}"
+
+
 def _header(comparison: Comparison) -> str:
     facts = [
         ("grid", comparison.grid_id),
@@ -284,37 +284,35 @@ def _header(comparison: Comparison) -> str:
         ("generated months", str(len(comparison.of(SOURCES[1])))),
         ("generator", f"{VERSION} {comparison.fingerprint}"),
     ]
-    cards = "".join(f"<div><dt>{html.escape(name)}</dt><dd>{html.escape(value)}</dd></div>" for name, value in facts)
     listed = ", ".join(each.scenario_id for each in comparison.samples)
     return (
-        f"<header><h1>Generated and bundled series of {html.escape(comparison.grid_id)}</h1>"
+        f"<header><h1>{html.escape(_title(comparison))}</h1>"
         "<p>The months of the year that the bundled series are of, beside the same months of generated years. Losses, "
         "slack and loading come from the AC power flow of every hour, in the reference topology.</p>"
-        f"<dl class=facts>{cards}</dl><p class=note>{html.escape(listed)}</p></header>"
+        f"{report.facts_html(facts)}<p class=note>{html.escape(listed)}</p></header>"
     )
 
 
 def _table(comparison: Comparison) -> str:
-    head = "".join(f"<th>{html.escape(heading)}</th>" for heading in HEADINGS)
-    rows = "".join(
-        f"<tr>{''.join(f'<td>{html.escape(cell)}</td>' for cell in cells)}</tr>" for cells in table_rows(comparison)
-    )
     return (
-        f"<section><h2>In numbers</h2><div class=scroll><table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody>"
-        "</table></div><p class=note>After 1 h: correlation of a value with the one an hour later. Distance: largest "
+        f"<section><h2>In numbers</h2>{report.table_html(HEADINGS, table_rows(comparison))}"
+        "<p class=note>After 1 h: correlation of a value with the one an hour later. Distance: largest "
         "difference of the two cumulative distributions, from 0 (the same) to 1.</p></section>"
     )
 
 
-def _figure(comparison: Comparison, caption: str, draw: Callable[[Comparison], Figure]) -> str:
-    with matplotlib.rc_context(_STYLE):
-        data = base64.b64encode(png_bytes(draw(comparison))).decode()
-    alt = html.escape(caption, quote=True)
-    return f"<figure><img src='data:image/png;base64,{data}' alt='{alt}'><figcaption>{alt}</figcaption></figure>"
+def _figure(comparison: Comparison, caption: str, draw: Callable[[Comparison, Theme], Figure]) -> str:
+    light, dark = (_png(comparison, draw, theme) for theme in (LIGHT, DARK))
+    return report.figure_html(caption, light, dark)
 
 
-def _colours() -> list[tuple[str, str]]:
-    return [(SOURCES[0], LIGHT.text), (SOURCES[1], LIGHT.series[1])]
+def _png(comparison: Comparison, draw: Callable[[Comparison, Theme], Figure], theme: Theme) -> bytes:
+    with matplotlib.rc_context(style(theme)):
+        return png_bytes(draw(comparison, theme))
+
+
+def _colours(theme: Theme) -> list[tuple[str, str]]:
+    return [(SOURCES[0], theme.text), (SOURCES[1], theme.series[1])]
 
 
 def _panels(n: int, columns: int, height: float) -> tuple[Figure, list[Axes]]:
@@ -326,14 +324,14 @@ def _panels(n: int, columns: int, height: float) -> tuple[Figure, list[Axes]]:
     return figure, axes[:n]
 
 
-def _draw_distributions(comparison: Comparison) -> Figure:
+def _draw_distributions(comparison: Comparison, theme: Theme) -> Figure:
     quantities = comparison.quantities
     figure, panels = _panels(len(quantities), 3, 2.0)
     for axes, quantity in zip(panels, quantities, strict=True):
         both = np.concatenate([comparison.values(source, quantity.key) for source in SOURCES])
         low, high = np.quantile(both, [0.001, 0.999]).tolist()
         bins = np.linspace(low, high, 41) if high > low else np.array([low - 1.0, low + 1.0])
-        for source, colour in _colours():
+        for source, colour in _colours(theme):
             values = comparison.values(source, quantity.key)
             share = np.histogram(values, bins)[0] / len(values)
             axes.stairs(share, bins, color=colour, linewidth=1.4, label=source)
@@ -343,11 +341,11 @@ def _draw_distributions(comparison: Comparison) -> Figure:
     return figure
 
 
-def _draw_days(comparison: Comparison) -> Figure:
+def _draw_days(comparison: Comparison, theme: Theme) -> Figure:
     shown = _shown(comparison)
     figure, panels = _panels(len(shown), 3, 2.4)
     for axes, quantity in zip(panels, shown, strict=True):
-        for source, colour in _colours():
+        for source, colour in _colours(theme):
             hours = [
                 np.concatenate([_in_hour(each, quantity.key, hour) for each in comparison.of(source)])
                 for hour in range(24)
@@ -362,11 +360,11 @@ def _draw_days(comparison: Comparison) -> Figure:
     return figure
 
 
-def _draw_correlations(comparison: Comparison) -> Figure:
+def _draw_correlations(comparison: Comparison, theme: Theme) -> Figure:
     shown = _shown(comparison)
     figure, panels = _panels(len(shown), 3, 2.4)
     for axes, quantity in zip(panels, shown, strict=True):
-        for source, colour in _colours():
+        for source, colour in _colours(theme):
             lags, values = autocorrelation([each.values[quantity.key] for each in comparison.of(source)])
             axes.plot(lags / STEPS_PER_HOUR, values, ".-", color=colour, linewidth=1.2, label=source)
         axes.set_title(quantity.label, fontsize=8)
@@ -376,11 +374,11 @@ def _draw_correlations(comparison: Comparison) -> Figure:
     return figure
 
 
-def _draw_week(comparison: Comparison) -> Figure:
+def _draw_week(comparison: Comparison, theme: Theme) -> Figure:
     shown = _shown(comparison)
     figure, panels = _panels(len(shown), 1, 1.7)
     for axes, quantity in zip(panels, shown, strict=True):
-        for source, colour in _colours():
+        for source, colour in _colours(theme):
             longest = max(comparison.of(source), key=lambda each: len(each.values["load"]))
             values = longest.values[quantity.key][: 7 * ROWS_PER_DAY]
             # Series that begin at 23:55 begin just before day 0.
@@ -402,55 +400,3 @@ def _in_hour(sample: Sample, key: str, hour: int) -> Floats:
     hours = (sample.first_row + np.arange(len(values))) % ROWS_PER_DAY // STEPS_PER_HOUR
     chosen: Floats = values[hours == hour]
     return chosen
-
-
-_STYLE: dict[str, Any] = {
-    "axes.edgecolor": LIGHT.muted,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.titlelocation": "left",
-    "grid.color": LIGHT.rule,
-    "font.family": "DejaVu Sans",
-    "font.size": 8,
-    "text.color": LIGHT.text,
-    "axes.labelcolor": LIGHT.text,
-    "xtick.color": LIGHT.muted,
-    "ytick.color": LIGHT.muted,
-    "legend.frameon": False,
-}
-
-_PAGE = """<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{title}</title>
-<style>
-* { box-sizing: border-box; }
-body { margin: 0 auto; padding: 1.5rem 1rem 4rem; max-width: 60rem; background: #fff; color: #1b1f24;
-  font: 16px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, sans-serif; -webkit-text-size-adjust: 100%; }
-h1 { font-size: 1.7rem; line-height: 1.2; margin: .5rem 0; }
-h2 { font-size: 1.15rem; margin: 2.5rem 0 .75rem; }
-.note, figcaption { color: #5c666f; font-size: .85rem; overflow-wrap: anywhere; }
-.facts { display: grid; grid-template-columns: repeat(4, 1fr); gap: .75rem; margin: 1.25rem 0 0; }
-@media (max-width: 40rem) { .facts { grid-template-columns: repeat(2, 1fr); } }
-.facts div { background: #f6f8fa; border-radius: .5rem; padding: .6rem .8rem; }
-.facts dt { color: #5c666f; font-size: .8rem; }
-.facts dd { margin: 0; font-size: 1.1rem; font-weight: 600; overflow-wrap: anywhere; }
-.scroll { overflow-x: auto; }
-table { border-collapse: collapse; width: 100%; font-size: .85rem; font-variant-numeric: tabular-nums; }
-th, td { padding: .35rem .6rem; text-align: right; white-space: nowrap; border-bottom: 1px solid #e4e7ea; }
-th { color: #5c666f; font-weight: 500; }
-th:nth-child(-n+2), td:nth-child(-n+2) { text-align: left; }
-tbody tr:nth-child(odd) td { border-bottom: 0; }
-figure { margin: 2.5rem 0 0; }
-img { display: block; width: 100%; height: auto; border: 1px solid #e4e7ea; border-radius: .5rem; }
-figcaption { margin-top: .5rem; }
-@media print { body { max-width: none; } figure, table { break-inside: avoid; } }
-</style>
-</head>
-<body>
-{body}
-</body>
-</html>
-"""

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from rich.progress import (
     MofNCompleteColumn,
     Progress,
     ProgressColumn,
+    TaskProgressColumn,
     TextColumn,
     TimeRemainingColumn,
     TransferSpeedColumn,
@@ -24,14 +26,15 @@ from rich.progress import (
 from rich.table import Table
 
 from rl2grid.errors import UsageError
-from rl2grid.grids import GRID_IDS, load_grid
-from rl2grid.scenarios import generated, holdings
-from rl2grid.scenarios.cache import data_folder
+from rl2grid.grids import GRID_IDS, Grid, load_grid
+from rl2grid.scenarios import generated, holdings, published
+from rl2grid.scenarios.cache import data_folder, remove_damaged
 from rl2grid.scenarios.download import download_dataset, find_archive
 from rl2grid.scenarios.export import export_scenario
 from rl2grid.scenarios.full import VARIABLE, full_data_folder
 from rl2grid.scenarios.library import import_folder, load_scenario
-from rl2grid.scenarios.splits import GENERATED_SPLITS
+from rl2grid.scenarios.progress import Report
+from rl2grid.scenarios.splits import HELD_OUT_SPLITS
 
 ALL_MONTHS = "0-11"
 
@@ -69,6 +72,7 @@ def _list(options: argparse.Namespace) -> int:
     table.add_column("size", justify="right", no_wrap=True)
     table.add_column("where", overflow="fold")
     for grid in grids:
+        _remove_damaged(grid)
         for holding in holdings.holdings(grid):
             table.add_row(grid.id, holding.kind, holding.what, decimal(holding.size), str(holding.place))
     _console().print(table)
@@ -81,7 +85,7 @@ def _add_make(actions: Any) -> None:
     parser.add_argument("grid", help="for example bus14")
     wanted = parser.add_mutually_exclusive_group(required=True)
     wanted.add_argument("--seed", type=int, default=None, help="seed of the year")
-    wanted.add_argument("--split", default=None, choices=tuple(GENERATED_SPLITS), help="all months of a split")
+    wanted.add_argument("--split", default=None, choices=tuple(HELD_OUT_SPLITS), help="all months of a split")
     parser.add_argument("--months", default=None, help=f"months of the year, as 0-11 or 0,3,6 (default {ALL_MONTHS})")
     parser.add_argument("--workers", type=int, default=None, help="processes; by default one per core")
     parser.set_defaults(run=_make)
@@ -91,11 +95,12 @@ def _make(options: argparse.Namespace) -> int:
     grid = load_grid(options.grid)
     workers = _workers(options.workers)
     months = _wanted_months(options)
-    with _progress(MofNCompleteColumn(), _Rate(), TimeRemainingColumn()) as bar:
+    with _progress(MofNCompleteColumn(), _Rate("/min", 60.0), TimeRemainingColumn()) as bar:
         task = bar.add_task(f"Making months of {grid.id}", total=len(months))
         for done in generated.make_packs(grid, months, workers):
             bar.update(task, completed=done)
     print(f"{len(months)} months of {grid.id} are in {generated.pack_folder(grid)}.")
+    _compare_with_published(grid, [generated.month_name(*month) for month in months])
     return 0
 
 
@@ -106,7 +111,7 @@ def _wanted_months(options: argparse.Namespace) -> list[tuple[int, int]]:
         return [(options.seed, month) for month in _month_numbers(options.months or ALL_MONTHS)]
     if options.months is not None:
         raise UsageError(f"Split {options.split} says which months are made: leave --months out, or give --seed.")
-    months = [generated.parse_months(name) for name in GENERATED_SPLITS[options.split]]
+    months = [generated.parse_months(name) for name in HELD_OUT_SPLITS[options.split]]
     return [(each.seed, each.first) for each in months]
 
 
@@ -139,7 +144,9 @@ def _add_import(actions: Any) -> None:
 
 
 def _import(options: argparse.Namespace) -> int:
-    scenario = import_folder(load_grid(options.grid), options.folder)
+    grid = load_grid(options.grid)
+    with _progress(DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn()) as bar:
+        scenario = import_folder(grid, options.folder, _reporting(bar, f"Reading {options.folder}"))
     print(f"Imported {scenario.id}: {scenario.n_rows:,} rows from {scenario.start_datetime:%Y-%m-%d %H:%M}.")
     return 0
 
@@ -155,7 +162,8 @@ def _add_export(actions: Any) -> None:
 def _export(options: argparse.Namespace) -> int:
     grid = load_grid(options.grid)
     scenario = load_scenario(grid.id, options.scenario)
-    folder = export_scenario(grid, scenario, options.folder)
+    with _progress(TaskProgressColumn(), _Rate(" values/s", 1.0), TimeRemainingColumn()) as bar:
+        folder = export_scenario(grid, scenario, options.folder, _reporting(bar, f"Writing {options.folder}"))
     print(f"Wrote {scenario.n_rows:,} rows of {scenario.id} to {folder} ({decimal(holdings.size_of(folder))}).")
     return 0
 
@@ -176,6 +184,8 @@ def _check(options: argparse.Namespace) -> int:
         from rl2grid.analysis import scenario_check
     except ImportError as error:
         raise UsageError(f"The page needs {error.name}: install it with `pip install rl2grid[analysis]`.") from None
+    _remove_damaged(grid)
+    _compare_with_published(grid, published.held_out_months())
     output = options.output or Path("reports") / f"scenarios-{grid.id}.html"
     wanted = scenario_check.wanted_scenarios(grid, options.years)
     samples = []
@@ -221,24 +231,56 @@ def _download(options: argparse.Namespace) -> int:
     folder: Path = options.folder or full_data_folder()
     archive = find_archive(grid.grid2op_name)
     with _progress(DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn()) as bar:
-        task = bar.add_task(f"Downloading {grid.grid2op_name}", total=None)
-        target = download_dataset(
-            grid, folder, archive, lambda present, total: bar.update(task, completed=present, total=total)
-        )
+        target = download_dataset(grid, folder, archive, _reporting(bar, f"Downloading {grid.grid2op_name}"))
     print(f"Dataset of {grid.id} in {target}. To play it: export {VARIABLE}={folder}")
     return 0
 
 
+def _remove_damaged(grid: Grid) -> None:
+    for copy in remove_damaged(grid.id):
+        print(f"Removed {copy}, which was damaged; it is made again when needed.")
+
+
+def _compare_with_published(grid: Grid, names: Sequence[str]) -> None:
+    comparison = published.compare_with_published(grid, names)
+    for deviation in comparison.deviations:
+        print(deviation)
+    if comparison.months and not comparison.deviations:
+        print(f"{comparison.months} held-out months of {grid.id} are as they were published.")
+
+
 class _Rate(ProgressColumn):
-    """Months per minute."""
+    """What is done in a unit of time."""
+
+    def __init__(self, unit: str, seconds: float) -> None:
+        super().__init__()
+        self._unit, self._seconds = unit, seconds
 
     def render(self, task: Any) -> str:
-        return "" if task.speed is None else f"{60 * task.speed:.1f}/min"
+        if task.speed is None:
+            return ""
+        rate = self._seconds * task.speed
+        return f"{rate:,.0f}{self._unit}" if rate >= 100 else f"{rate:.1f}{self._unit}"
 
 
-def _progress(*columns: ProgressColumn) -> Progress:
+def _reporting(bar: Progress, description: str) -> Report:
+    """A task on ``bar`` that shows what it is told."""
+    task = bar.add_task(description, total=None)
+    return lambda done, total: bar.update(task, completed=done, total=total)
+
+
+@contextlib.contextmanager
+def _progress(*columns: ProgressColumn) -> Iterator[Progress]:
     shown: Sequence[ProgressColumn] = (TextColumn("{task.description}"), BarColumn(), *columns)
-    return Progress(*shown, console=Console(stderr=True))
+    bar = Progress(*shown, console=Console(stderr=True))
+    bar.start()
+    try:
+        yield bar
+    except UsageError:
+        bar.live.transient = True  # All that stays is the sentence that says why.
+        raise
+    finally:
+        bar.stop()
 
 
 def _console() -> Console:

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 from rl2grid.envs.tasks import TaskOptions, find_task
 from rl2grid.errors import UsageError, one_of
-from rl2grid.scenarios.splits import TEST_OF, VALIDATION_OF
 
 if TYPE_CHECKING:
     from rl2grid.algorithms.policy_agent import PolicyAgent
@@ -42,8 +41,6 @@ class TrainFlags:
     """Run folder, which must not exist yet; None: runs/<task>-<algorithm>-<seed>."""
     heuristic: str | None = None
     """What plays while the grid is safe: None, ``idle`` or ``recovery``."""
-    split: str = "train"
-    """Scenarios to learn from: ``train`` (bundled series), or ``generated-train`` (as many months as are asked for)."""
     reward: str = "default"
     """Reward preset: ``default``, ``paper`` or ``released``."""
     engine: str = "native"
@@ -66,7 +63,7 @@ class TrainFlags:
     """A checkpoint is written when the last one is older than this, and at the end."""
 
 
-_ENV_KEYWORDS = ("engine", "heuristic", "split", "reward", "dispatch", "maintenance", "opponent")
+_ENV_KEYWORDS = ("engine", "heuristic", "reward", "dispatch", "maintenance", "opponent")
 
 
 def train(command_line: list[str]) -> int:
@@ -131,9 +128,7 @@ def _report(folder: Path, task_id: str) -> int:
     if not runs.is_finished(folder):
         print(f"Run stopped: {folder}. Go on with `rl2grid train --resume {folder}`.")
         return INTERRUPTED
-    args, _ = runs.read_config(folder)
-    split = TEST_OF[args.env_keywords["split"]]
-    print(f"Run complete: {folder}. Evaluate it with `rl2grid evaluate {folder} {task_id} --split {split}`.")
+    print(f"Run complete: {folder}. Evaluate it with `rl2grid evaluate {folder} {task_id} --split test`.")
     return 0
 
 
@@ -193,5 +188,4 @@ def _validator(args: RunArgs) -> Callable[[PolicyAgent], Mapping[str, float]]:
     from rl2grid.experiments.evaluation import validator
 
     keywords = args.env_keywords
-    split = VALIDATION_OF[keywords["split"]]
-    return validator(args.task, split=split, engine=keywords["engine"], workers=args.num_workers)
+    return validator(args.task, engine=keywords["engine"], workers=args.num_workers)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, cast
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium
 import numpy as np
@@ -12,6 +12,10 @@ from numpy.typing import NDArray
 from rl2grid.engines.transition import Listener
 from rl2grid.envs.player import SimulationResult, TaskDescription, TaskPlayer, single_spaces
 from rl2grid.envs.tasks import TaskOptions, find_task
+from rl2grid.mdp.state import GridState
+
+if TYPE_CHECKING:
+    from rl2grid.engines.native.what_if import ActionOutcomes, OutageOutcomes
 
 
 class PowerGridEnv(gymnasium.Env[NDArray[np.float32], Any], TaskDescription):
@@ -114,6 +118,11 @@ class PowerGridEnv(gymnasium.Env[NDArray[np.float32], Any], TaskDescription):
         """Functions called after every grid step with the state and row 0: append your own."""
         return self._player.transitions.listeners
 
+    @property
+    def state(self) -> GridState:
+        """The grid after the last step, in physical units: row 0 of each array. To be looked at, not written to."""
+        return self._player.state
+
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
@@ -147,6 +156,35 @@ class PowerGridEnv(gymnasium.Env[NDArray[np.float32], Any], TaskDescription):
             UsageError: a wrong action or horizon, no forecast for it, or no episode in progress.
         """
         return self._player.simulate(0, action, horizon)
+
+    def what_if(self, actions: Sequence[int] | None = None) -> ActionOutcomes:
+        """What each topology action would do to the loadings of the next step, by its forecast, in one call.
+
+        The power flow is that of ``simulate`` before protections trip lines; see ``docs/what_if.md``.
+
+        Args:
+            actions: ids of those to try; all of the task if left out.
+
+        Returns:
+            Arrays of one entry per action: ``worst_loading`` (infinite where no flow is found), ``verdict``,
+            ``overloads`` and ``legal``.
+
+        Raises:
+            UsageError: continuous actions, an action that does not exist, no episode in progress, or the reference
+                engine.
+        """
+        return self._player.what_if(0, actions)
+
+    def security(self) -> OutageOutcomes:
+        """What the loss of each line would do to the present loadings (N-1), in one call; see ``docs/what_if.md``.
+
+        Returns:
+            Arrays of one entry per line: ``worst_loading``, ``verdict``, ``overloads`` and ``was_open``.
+
+        Raises:
+            UsageError: no episode in progress, or the reference engine.
+        """
+        return self._player.security(0)
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Which discrete actions are legal now, bool [action].

@@ -32,6 +32,7 @@ _ALWAYS = "always"
 INFO_KEYS: tuple[InfoKey, ...] = (
     InfoKey("scenario", "str", "", _ALWAYS, "id of the scenario being played"),
     InfoKey("start", "int", "row", _ALWAYS, "row of the scenario at which the episode began"),
+    InfoKey("start_redraws", "int", "", _ALWAYS, "rows drawn as start before, in which doing nothing overloads a line"),
     InfoKey("step", "int", "grid steps", _ALWAYS, "grid steps of the episode so far"),
     InfoKey("episode_length", "int", "grid steps", _ALWAYS, "grid steps of a completed episode, T"),
     InfoKey("survival", "float", "share of T", _ALWAYS, "grid steps survived / T; 1 when the episode is completed"),

@@ -51,6 +51,7 @@ class NativePlayer(TaskPlayer):
         self._rows = np.arange(n)
         self._scenarios = np.full(n, "", object)
         self._starts = np.zeros(n, np.int64)
+        self._redraws = np.zeros(n, np.int64)
         self._earlier_steps = np.zeros(n, np.int64)  # grid steps of earlier episodes of a seed's stream
         self._nothing_said = np.full(n, "", object)
 
@@ -121,6 +122,7 @@ class NativePlayer(TaskPlayer):
         plan, seat = self._plans[i], self._seat(i)
         assert plan is not None
         self._scenarios[i], self._starts[i], self._earlier_steps[i] = plan.scenario_id, plan.start, seat.grid_steps
+        self._redraws[i] = plan.redraws
 
     def _commands(self, actions: Any) -> Commands:
         """The actions of all rows, checked, and noted in their seats."""
@@ -178,6 +180,7 @@ class NativePlayer(TaskPlayer):
         info = {
             "scenario": self._scenarios.copy(),
             "start": self._starts.copy(),
+            "start_redraws": self._redraws.copy(),
             **batch_info(state, self.constraint),
             "action_effect": effects,
         }

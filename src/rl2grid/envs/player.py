@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium
 import numpy as np
@@ -30,6 +31,10 @@ from rl2grid.mdp.features import feature_slices, observation_size, observation_w
 from rl2grid.mdp.rewards import resolve_reward
 from rl2grid.mdp.state import GridState
 from rl2grid.scenarios.episodes import EpisodePlan, plan_episode
+
+if TYPE_CHECKING:
+    from rl2grid.engines.native.engine import NativeEngine
+    from rl2grid.engines.native.what_if import ActionOutcomes, OutageOutcomes, WhatIf
 
 _RESET_OPTIONS = ("scenario", "start")
 
@@ -95,6 +100,7 @@ class TaskPlayer:
         self._hash = action_set_hash(self.grid, task.level) if task.kind == "T" else None
         self._plans: list[EpisodePlan | None] = [None] * n
         self._seats: list[Seat | None] = [None] * n
+        self._solver: WhatIf | None = None
         self._pending = np.zeros(n, np.bool_)  # the episode ended inside reset, its ending is still to be returned
 
     @property
@@ -143,7 +149,7 @@ class TaskPlayer:
         """The ``info`` of row ``i``; see :data:`rl2grid.envs.info.INFO_KEYS`."""
         plan, seat, state = self._plans[i], self._seat(i), self.state
         assert plan is not None
-        info = {"scenario": plan.scenario_id, "start": plan.start, **episode_info(state, i, self.constraint)}
+        info = {**_start_info(plan), **episode_info(state, i, self.constraint)}
         info["action_effect"] = self.transitions.effects[i]
         info["grid_steps"] = seat.grid_steps + info["step"]
         info["over"] = bool(self._pending[i])
@@ -170,10 +176,39 @@ class TaskPlayer:
         result = self.transitions.simulate(i, played, horizon)
         observation = np.zeros(observation_size(self.grid, self.task.kind), np.float32)
         self._observe(result, 0, observation)
-        info = {"scenario": plan.scenario_id, "start": plan.start, **episode_info(result, 0, self.constraint)}
+        info = {**_start_info(plan), **episode_info(result, 0, self.constraint)}
         info["action_effect"] = effect or clipping(self.grid, result, 0, played)
         reward = float(result.transition_reward[0])
         return SimulationResult(observation, reward, info["cost"], bool(result.terminated[0]), info)
+
+    def what_if(self, i: int, actions: Sequence[int] | None) -> ActionOutcomes:
+        """What each action would do in the next step; see :meth:`PowerGridEnv.what_if`."""
+        if self._catalogue is None:
+            raise UsageError(f"{self.task.id} has continuous actions: a what-if is of topology actions.")
+        ids = (
+            None
+            if actions is None
+            else np.array([action_number(action, len(self._catalogue)) for action in actions], np.int32)
+        )
+        from rl2grid.engines.native.what_if import Moment, what_if
+
+        return what_if(self._native_engine(i), i, self._catalogue, ids, Moment.NEXT_STEP)
+
+    def security(self, i: int) -> OutageOutcomes:
+        """What the loss of each line would do now; see :meth:`PowerGridEnv.security`."""
+        from rl2grid.engines.native.what_if import WhatIf, snapshot_of
+
+        engine = self._native_engine(i)
+        if self._solver is None:
+            self._solver = WhatIf(self.grid, engine.arrays.network)
+        return self._solver.outages(snapshot_of(engine, i))
+
+    def _native_engine(self, i: int) -> NativeEngine:
+        if self._plans[i] is None or self.is_over(i):
+            raise UsageError("There is no episode in progress to ask about: call reset first.")
+        if self.options.engine != "native":
+            raise UsageError('A what-if is answered by the native engine only: choose engine="native".')
+        return cast("NativeEngine", self.engine)
 
     def state_dict(self) -> list[dict[str, Any]]:
         """Everything needed to bring all rows back to where they are, as plain values."""
@@ -248,6 +283,10 @@ class TaskPlayer:
         if self._catalogue is None:
             return StepAction(int(ActionKind.INJECTION), values=validate_continuous(self.grid, action))
         return self._catalogue[action_number(action, len(self._catalogue))]
+
+
+def _start_info(plan: EpisodePlan) -> dict[str, Any]:
+    return {"scenario": plan.scenario_id, "start": plan.start, "start_redraws": plan.redraws}
 
 
 def check_action(task: Task, action: Any) -> None:

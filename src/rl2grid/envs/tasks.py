@@ -10,7 +10,7 @@ from typing import Any
 from rl2grid.engines import DISPATCHES, ENGINES, HEURISTICS
 from rl2grid.errors import UsageError, one_of
 from rl2grid.grids import GRID_IDS, Grid, load_grid
-from rl2grid.scenarios.library import SPLITS
+from rl2grid.scenarios.splits import SPLITS
 
 VERSION = 0
 """Version of every id; raised when anything that defines a result changes."""
@@ -106,8 +106,8 @@ class TaskOptions:
     """A preset (``"default"``, ``"paper"``, ``"released"``), the weights of the three default components,
     or a compiled function ``(state, i) -> (survive, overload, cost)``."""
     split: str = "train"
-    """Which scenarios are played: of the bundled series ``"train"``, ``"validation"``, ``"test"``, or all of them,
-    ``"bundled"``; of generated months ``"generated-train"``, ``"generated-validation"`` or ``"generated-test"``."""
+    """Which scenarios are played: ``"train"`` (months without end), ``"validation"`` or ``"test"`` (20 months each), or
+    ``"bundled"``, the series inside the Grid2Op wheel."""
     scenario: str | None = None
     """Play this scenario only."""
     normalize: str | None = "physical"

@@ -37,7 +37,7 @@ from rl2grid.experiments.agents import make_agent
 from rl2grid.experiments.episode import PlayedEpisode
 from rl2grid.experiments.players import Job, Progress, Setting, players
 from rl2grid.mdp.actions import action_set_hash
-from rl2grid.scenarios.library import generator_version, list_scenarios, scenario_pack_hash
+from rl2grid.scenarios.library import check_in_split, generator_version, list_scenarios, scenario_pack_hash
 from rl2grid.versions import library_versions
 
 PARTIAL_FILE = "episodes.partial.csv"
@@ -88,11 +88,12 @@ def evaluate(
     task = find_task(task_id)
     chosen = make_agent(agent, task.id) if isinstance(agent, str | Path) else agent
     keywords = _env_keywords(chosen, {**options, "split": split, "heuristic": heuristic})
-    jobs = _jobs(_checked_scenarios(task, split, scenarios), seeds, start)
+    chosen_scenarios = _checked_scenarios(task, split, scenarios)
+    jobs = _jobs(chosen_scenarios, seeds, start)
     return run_evaluation(
         Setting(task.id, agent, keywords),
         jobs,
-        identity=_identity(task, chosen, name or chosen.name, keywords, start),
+        identity=_identity(task, chosen, name or chosen.name, keywords, start, chosen_scenarios),
         command=command or _call(agent, task, keywords, scenarios, seeds, start, name),
         workers=_number_of_workers(workers, TaskOptions(**keywords).engine),
         output=output,
@@ -193,22 +194,13 @@ def _number_of_workers(workers: int | None, engine: str) -> int:
 
 
 def _checked_scenarios(task: Task, split: str, scenarios: Sequence[str] | None) -> tuple[str, ...]:
-    listed = list_scenarios(task.grid_id, split)
     if scenarios is None:
-        return listed
-    for scenario in scenarios:
-        if scenario not in listed:
-            raise UsageError(
-                f"Scenario {scenario!r} is not in the split {split} of {task.grid_id}, "
-                f"which has {len(listed)}: {_some(listed)}."
-            )
+        return list_scenarios(task.grid_id, split)
     if not scenarios:
-        raise UsageError(f"No scenario was given: choose some of {_some(listed)}.")
+        raise UsageError(f"No scenario was given: name some of the split {split} of {task.grid_id}, or leave it out.")
+    for scenario in scenarios:
+        check_in_split(task.grid_id, split, scenario)
     return tuple(scenarios)
-
-
-def _some(names: Sequence[str]) -> str:
-    return ", ".join(names[:10]) + (", ..." if len(names) > 10 else "")
 
 
 def _jobs(scenarios: Sequence[str], seeds: Sequence[int], start: int) -> list[Job]:
@@ -220,7 +212,9 @@ def _jobs(scenarios: Sequence[str], seeds: Sequence[int], start: int) -> list[Jo
     return jobs
 
 
-def _identity(task: Task, agent: Agent, name: str, keywords: Mapping[str, Any], start: int) -> dict[str, Any]:
+def _identity(
+    task: Task, agent: Agent, name: str, keywords: Mapping[str, Any], start: int, scenarios: Sequence[str]
+) -> dict[str, Any]:
     options = asdict(TaskOptions(**keywords))
     reward = options["reward"]
     options["reward"] = f"{reward.__module__}.{reward.__qualname__}" if callable(reward) else reward
@@ -234,7 +228,7 @@ def _identity(task: Task, agent: Agent, name: str, keywords: Mapping[str, Any], 
         "start": start,
         "grid_hash": task.grid.hash,
         "generator_version": generator_version(options["split"]),
-        "scenario_pack_hash": scenario_pack_hash(task.grid_id, options["split"]),
+        "scenario_pack_hash": scenario_pack_hash(task.grid_id, options["split"], scenarios),
         "action_set_hash": action_set_hash(task.grid, task.level) if task.kind == "T" else None,
         "versions": library_versions(),
     }

@@ -40,7 +40,7 @@ from rl2grid.envs.tasks import Task, TaskOptions, find_task
 from rl2grid.errors import UsageError, one_of
 from rl2grid.mdp.actions import action_set_hash
 from rl2grid.scenarios.library import generator_version, scenario_pack_hash
-from rl2grid.scenarios.splits import TRAINING_SPLITS
+from rl2grid.scenarios.splits import TRAIN
 from rl2grid.versions import library_versions
 
 CONFIG_FILE = "config.json"
@@ -400,9 +400,8 @@ def _resolved(args: RunArgs) -> RunArgs:
         raise UsageError("A run stores its reward by name: choose a preset or three weights, not a function.")
     # Every keyword is stored, so that the run stays what it is when a default changes.
     keywords = {name: getattr(TaskOptions(**keywords), name) for name in allowed}
-    if keywords["split"] not in TRAINING_SPLITS:  # "bundled" holds the test months too
-        allowed_splits = " or ".join(map(repr, TRAINING_SPLITS))
-        raise UsageError(f"Training on the {keywords['split']} scenarios is refused: choose split {allowed_splits}.")
+    if keywords["split"] != TRAIN:
+        raise UsageError(f"Training on the {keywords['split']} scenarios is refused: choose split {TRAIN!r}.")
     if args.evaluate_every < 1:
         raise UsageError(f"evaluate_every must be at least 1 decision, not {args.evaluate_every}.")
     folder = args.folder or Path("runs") / f"{_slug(task)}-{args.algorithm}-{args.hyperparameters.seed}"

@@ -5,14 +5,21 @@ A series is two files: ``<name>-<key>.npy``, all its arrays one after the other 
 that the arrays depend on, so a changed source makes a new copy instead of a stale one. Files are
 written to a temporary name and renamed; one process makes a copy while the others wait; a copy that
 is missing or does not match its manifest is made again.
+
+Hashing a copy of 100 MB takes longer than opening it may take. The manifest therefore remembers the size,
+times and number of the file that was hashed last, and the values are hashed again only where these differ;
+:func:`remove_damaged` always hashes them. What changes a file without changing its times, such as a failing
+disk, is found by the latter alone.
 """
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -29,6 +36,10 @@ from rl2grid.scenarios.folder import FolderContent
 FORMAT_VERSION = 1
 """Raised whenever the files below a version's folder would be read differently."""
 _ALIGNMENT = 64
+_SETTLED = 2_000_000_000
+"""Nanoseconds after which another change of a file is sure to change its times, on any file system."""
+_SEEN, _SUM = "seen", "manifest_sha256"
+"""Entries of the manifest about the copy on this disk; all others are about its content."""
 
 
 @dataclass(frozen=True)
@@ -70,46 +81,138 @@ def cached_series(grid_id: str, name: str, key: str, build: Callable[[], FolderC
     return series
 
 
+def remove_damaged(grid_id: str) -> list[Path]:
+    """Hash every copy of a grid, remove those that do not match their manifest, and return their files.
+
+    Raises:
+        UsageError: A damaged copy cannot be removed.
+    """
+    copies = sorted((data_folder() / "series" / f"v{FORMAT_VERSION}" / grid_id).glob("[!.]*.npy"))
+    try:
+        return [data for data in copies if not _matches(data) and _remove(data)]
+    except OSError as error:
+        raise UsageError(
+            f"The data folder {data_folder()} has damaged files that cannot be removed ({error})."
+        ) from error
+
+
+def _matches(data: Path) -> bool:
+    record = _read_manifest(data.with_suffix(".json"))
+    return record is not None and _is_sound(data, record)
+
+
+def _remove(data: Path) -> bool:
+    """Whether the copy was removed; one that was being made is sound by now."""
+    with filelock.FileLock(data.with_suffix(".lock")):
+        if not data.is_file() or _matches(data):
+            return False
+        data.unlink()
+        data.with_suffix(".json").unlink(missing_ok=True)
+        return True
+
+
 def _make(data: Path, manifest: Path, content: FolderContent) -> CachedSeries:
     table: dict[str, dict[str, Any]] = {}
-    buffer = bytearray()
+    size = 0
     for name, array in content.arrays.items():
-        buffer.extend(bytes(-len(buffer) % _ALIGNMENT))
-        portable = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
-        table[name] = {"dtype": portable.dtype.str, "shape": portable.shape, "offset": len(buffer)}
-        buffer.extend(portable.tobytes())
-    record = {
-        "start_datetime": content.start_datetime.isoformat(),
-        "arrays": table,
-        "sha256": hashlib.sha256(buffer).hexdigest(),
-    }
+        size += -size % _ALIGNMENT
+        portable = array.dtype.newbyteorder("<").str
+        table[name] = {"dtype": portable, "shape": array.shape, "offset": size}
+        size += array.nbytes
+    digest = hashlib.sha256()
     temporary = data.with_name(f".{data.name}.{os.getpid()}")
     with temporary.open("wb") as stream:
-        np.save(stream, np.frombuffer(buffer, np.uint8))
+        header = {"descr": "|u1", "fortran_order": False, "shape": (size,)}
+        np.lib.format.write_array_header_1_0(stream, header)
+        for part in _parts(content.arrays):
+            digest.update(part)
+            stream.write(part)
     os.replace(temporary, data)
-    temporary = manifest.with_name(f".{manifest.name}.{os.getpid()}")
-    temporary.write_text(json.dumps(record, indent=1, sort_keys=True))
-    os.replace(temporary, manifest)
-    series = _read(data, manifest)
+    record = {"start_datetime": content.start_datetime.isoformat(), "arrays": table, "sha256": digest.hexdigest()}
+    _write_manifest(manifest, record)
+    series = _map(data, record)
     if series is None:
         raise OSError(f"{data} does not read back as it was written")
     return series
 
 
+def _parts(arrays: Mapping[str, NDArray[Any]]) -> Iterator[memoryview]:
+    """The bytes of all arrays, each beginning at a multiple of the alignment."""
+    size = 0
+    for array in arrays.values():
+        yield memoryview(bytes(-size % _ALIGNMENT))
+        portable = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
+        yield portable.reshape(-1).view(np.uint8).data
+        size += -size % _ALIGNMENT + portable.nbytes
+
+
 def _read(data: Path, manifest: Path) -> CachedSeries | None:
     """The series, or None where a file is missing or damaged."""
+    record = _read_manifest(manifest)
+    if record is None:
+        return None
     try:
-        record = json.loads(manifest.read_text())
-        buffer = np.asarray(np.load(data, mmap_mode="r"))
-        if buffer.dtype != np.uint8 or hashlib.sha256(buffer.data).hexdigest() != record["sha256"]:
-            return None
-        arrays = {name: _view(buffer, **place) for name, place in record["arrays"].items()}
-        start = datetime.fromisoformat(record["start_datetime"])
+        status = _status(data)
+        if record.get(_SEEN) != status:
+            if not _is_sound(data, record):
+                return None
+            _remember(manifest, record, status)
+        return _map(data, record)
     except (OSError, ValueError, KeyError, TypeError, EOFError):
         return None
+
+
+def _map(data: Path, record: dict[str, Any]) -> CachedSeries | None:
+    """The arrays that a manifest describes, whose values are not looked at; None where they are not there."""
+    buffer = np.asarray(np.load(data, mmap_mode="r"))
+    arrays = {name: _view(buffer, **place) for name, place in record["arrays"].items()}
+    start = datetime.fromisoformat(record["start_datetime"])
     # The values are named through their checksum: hashing the small manifest hashes everything.
-    content_hash = hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
+    content = {name: value for name, value in record.items() if name not in (_SEEN, _SUM)}
+    content_hash = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
     return CachedSeries(start, arrays, content_hash)
+
+
+def _is_sound(data: Path, record: dict[str, Any]) -> bool:
+    """Whether the values are those that the manifest was written for."""
+    try:
+        buffer = np.asarray(np.load(data, mmap_mode="r"))
+    except (OSError, ValueError, EOFError):
+        return False
+    return buffer.dtype == np.uint8 and bool(hashlib.sha256(buffer.data).hexdigest() == record["sha256"])
+
+
+def _read_manifest(manifest: Path) -> dict[str, Any] | None:
+    """The manifest, or None where it is missing or damaged."""
+    try:
+        record: dict[str, Any] = json.loads(manifest.read_bytes())
+        return record if record.pop(_SUM) == _sum(record) else None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return None
+
+
+def _write_manifest(manifest: Path, record: dict[str, Any]) -> None:
+    temporary = manifest.with_name(f".{manifest.name}.{os.getpid()}")
+    temporary.write_text(json.dumps(record | {_SUM: _sum(record)}, indent=1, sort_keys=True))
+    os.replace(temporary, manifest)
+
+
+def _sum(record: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
+
+
+def _status(data: Path) -> list[int]:
+    """What changes when a file does: size, times of its content and of its record, and its number."""
+    status = data.stat()
+    return [status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino]
+
+
+def _remember(manifest: Path, record: dict[str, Any], status: list[int]) -> None:
+    """Note that the file of this status was hashed, so that the next process need not do it again."""
+    if time.time_ns() - max(status[1:3]) < _SETTLED:
+        return
+    with contextlib.suppress(OSError):  # A folder that is only read is hashed every time.
+        _write_manifest(manifest, record | {_SEEN: status})
 
 
 def _view(buffer: NDArray[np.uint8], dtype: str, shape: list[int], offset: int) -> NDArray[Any]:

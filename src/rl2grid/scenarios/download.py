@@ -15,21 +15,18 @@ import shutil
 import tarfile
 import urllib.error
 import urllib.request
-from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
+from rl2grid.scenarios.progress import Report
 
 TIMEOUT = 20.0
 """Seconds without an answer after which a server counts as unreachable."""
 SPACE_FACTOR = 2.5
 """Space for the archive and its content, whose tables are compressed already, relative to the archive."""
 _BLOCK = 2**18
-
-Report = Callable[[int, int], None]
-"""Told how many bytes of the archive are there, and how many there will be."""
 
 
 class Archive(NamedTuple):
@@ -74,7 +71,7 @@ def download_dataset(grid: Grid, folder: Path, archive: Archive, report: Report)
         grid: the grid.
         folder: where datasets are kept; made if need be.
         archive: what to fetch.
-        report: told of the progress.
+        report: told how many bytes of the archive are there.
 
     Returns:
         The folder of the dataset.

@@ -5,28 +5,28 @@ All of it is a function of the seed and the episode's number, and of nothing els
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
-from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
-from rl2grid.scenarios.cache import data_folder
-from rl2grid.scenarios.full import full_data_folder, is_full_requested
+from rl2grid.scenarios.full import is_full_requested
 from rl2grid.scenarios.generated import draw_training_months, maintenance_of
 from rl2grid.scenarios.library import check_in_split, list_scenarios, load_scenario
 from rl2grid.scenarios.maintenance import sample_maintenance
 from rl2grid.scenarios.scenario import Scenario
-from rl2grid.scenarios.splits import GENERATED_TRAINING, TRAINING_SPLITS
+from rl2grid.scenarios.splits import TRAIN
 from rl2grid.streams import Purpose, Stream
 
 MAX_STEPS = 8064
 """Steps of a completed episode where the series is that long: four weeks (paper, Section 4)."""
 MIN_TRAINING_STEPS = 288
 """A random start leaves at least this many steps to play, or half the window if that is shorter."""
+MAX_REDRAWS = 100
+"""After so many overloaded rows an episode starts in the first one of its month, which the generator keeps secure."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,13 @@ class EpisodePlan:
     """Steps of the completed episode, T."""
     maintenance: bool = True
     """Whether planned outages happen."""
+    redraws: int = 0
+    """Rows that were drawn as the start before, and overload a line with nothing done."""
+
+
+class _Start(NamedTuple):
+    row: int
+    redraws: int
 
 
 def plan_episode(
@@ -59,12 +66,11 @@ def plan_episode(
 ) -> EpisodePlan:
     """Decide episode ``number`` of the stream of episodes of ``seed``.
 
-    Training draws a random row of the split, uniformly among those with enough left to play
-    (:data:`MIN_TRAINING_STEPS`); of the full dataset, whose scenarios have one length, the scenario is drawn
-    uniformly, so that planning does not have to read all of them; of generated months, a year, a month and a row of
-    it, and the episode goes on in the next month. The other splits are enumerated: episode ``number`` of seed
-    ``seed`` plays scenario ``seed + number`` of the list (beginning again at its end) from row 0. ``scenario`` and
-    ``start`` replace what would be drawn and leave every other draw as it was.
+    Training draws a year, a month of it and a row of that month, again where nothing done overloads a line in that row
+    (in the reference topology, with everything in service), and the episode goes on in the next month; of the full
+    dataset, a scenario and a row with enough left to play (:data:`MIN_TRAINING_STEPS`). The other splits are
+    enumerated: episode ``number`` of seed ``seed`` plays scenario ``seed + number`` of the list (beginning again at
+    its end) from row 0. ``scenario`` and ``start`` replace what would be drawn and leave every other draw as it was.
 
     Raises:
         UsageError: ``split`` is unknown, ``scenario`` is not in it, or ``start`` leaves nothing to play.
@@ -73,11 +79,13 @@ def plan_episode(
         check_in_split(grid.id, split, scenario)
     else:
         scenario = _choose_scenario(grid, split, seed, number)
-    n_steps = load_scenario(grid.id, scenario).n_steps
+    series = load_scenario(grid.id, scenario)
+    redraws = 0
     if start is None:
-        start = _draw_start(split, n_steps, seed, number) if split in TRAINING_SPLITS else 0
-    _check_start(start, scenario, n_steps)
-    return EpisodePlan(seed, number, scenario, int(start), min(MAX_STEPS, n_steps - int(start)), maintenance)
+        start, redraws = _draw_start(grid, series, seed, number) if split == TRAIN else _Start(0, 0)
+    _check_start(start, scenario, series.n_steps)
+    n_steps = min(MAX_STEPS, series.n_steps - int(start))
+    return EpisodePlan(seed, number, scenario, int(start), n_steps, maintenance, redraws)
 
 
 def admissible_starts(n_steps: int) -> int:
@@ -107,31 +115,38 @@ def maintenance_matrix(grid: Grid, scenario: Scenario, plan: EpisodePlan) -> NDA
 
 
 def _choose_scenario(grid: Grid, split: str, seed: int, number: int) -> str:
-    if split == GENERATED_TRAINING:
+    if split == TRAIN and not is_full_requested():
         return f"generated/{draw_training_months(seed, number)}"
     ids = list_scenarios(grid.id, split)
-    return _draw_scenario(grid, ids, seed, number) if split in TRAINING_SPLITS else ids[(seed + number) % len(ids)]
+    if split == TRAIN:
+        return ids[Stream(seed, number, Purpose.SCENARIO).integer(len(ids))]
+    return ids[(seed + number) % len(ids)]
 
 
-def _draw_scenario(grid: Grid, ids: tuple[str, ...], seed: int, number: int) -> str:
-    stream = Stream(seed, number, Purpose.SCENARIO)
-    if is_full_requested():
-        return ids[stream.integer(len(ids))]
-    ends = _cumulative_starts(grid, ids, data_folder(), full_data_folder())
-    return ids[int(np.searchsorted(ends, stream.integer(int(ends[-1])), side="right"))]
+def _draw_start(grid: Grid, series: Scenario, seed: int, number: int) -> _Start:
+    starts = admissible_starts(series.n_steps)
+    stream = Stream(seed, number, Purpose.START)
+    if series.source != "generated":
+        return _Start(stream.integer(starts), 0)
+    starts = min(starts, MAX_STEPS)  # What follows is there to go on in.
+    for redraws in range(MAX_REDRAWS):
+        row = stream.integer(starts)
+        if _is_secure(grid, series, row):
+            return _Start(row, redraws)
+    return _Start(0, MAX_REDRAWS)
 
 
-def _draw_start(split: str, n_steps: int, seed: int, number: int) -> int:
-    starts = admissible_starts(n_steps)
-    if split == GENERATED_TRAINING:
-        starts = min(starts, MAX_STEPS)  # What follows is there to go on in.
-    return Stream(seed, number, Purpose.START).integer(starts)
+def _is_secure(grid: Grid, series: Scenario, row: int) -> bool:
+    """Whether no line is overloaded in a row, in the reference topology with everything in service."""
+    # Imported where it is needed: compiling takes long, and planning recorded series compiles nothing.
+    from rl2grid.scenarios.generator.security import assess
 
-
-@functools.lru_cache(maxsize=32)
-def _cumulative_starts(grid: Grid, ids: tuple[str, ...], data: Path, full_data: Path) -> NDArray[np.int64]:
-    """Number of rows at which an episode may start in the scenarios up to and with each."""
-    return np.cumsum([admissible_starts(load_scenario(grid.id, scenario_id).n_steps) for scenario_id in ids])
+    load_p, load_q, prod_p = (
+        np.rint(10 * array[row : row + 1]).astype(np.int32) for array in (series.load_p, series.load_q, series.prod_p)
+    )
+    voltage = None if series.prod_v is None else np.array(series.prod_v[row])
+    verdict = assess(grid, voltage, load_p, load_q, prod_p)
+    return verdict.converged and bool(verdict.loading[0] <= 1)
 
 
 def _check_start(start: object, scenario_id: str, n_steps: int) -> None:

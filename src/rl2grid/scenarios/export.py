@@ -6,7 +6,7 @@ import bz2
 import json
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,17 +16,18 @@ from numpy.typing import NDArray
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid, MaintenanceConfig
 from rl2grid.scenarios.generated import maintenance_of
+from rl2grid.scenarios.progress import Report, ignore
 from rl2grid.scenarios.scenario import Scenario
 
 _CHUNK = 2048
 """Rows that are turned into text at once."""
 
 
-def export_scenario(grid: Grid, scenario: Scenario, folder: Path) -> Path:
+def export_scenario(grid: Grid, scenario: Scenario, folder: Path, report: Report = ignore) -> Path:
     """Write ``scenario`` as ``folder``: bzip2 tables of the shortest decimals that read back as the same float32.
 
     Where planned outages are sampled, Grid2Op's ``maintenance_meta.json`` says how. The folder appears
-    whole or not at all.
+    whole or not at all. ``report`` is told how many values were written.
 
     Returns:
         The folder.
@@ -40,7 +41,7 @@ def export_scenario(grid: Grid, scenario: Scenario, folder: Path) -> Path:
     temporary = folder.with_name(f".{folder.name}.{os.getpid()}")
     try:
         temporary.mkdir(parents=True)
-        _write_files(grid, scenario, temporary)
+        _write_files(grid, scenario, temporary, report)
         os.replace(temporary, folder)
     except OSError as error:
         raise UsageError(f"Folder {folder} cannot be written ({error}): choose another place.") from error
@@ -49,14 +50,19 @@ def export_scenario(grid: Grid, scenario: Scenario, folder: Path) -> Path:
     return folder
 
 
-def _write_files(grid: Grid, scenario: Scenario, folder: Path) -> None:
+def _write_files(grid: Grid, scenario: Scenario, folder: Path, report: Report) -> None:
+    done, total = 0, sum(array.size for array in scenario.arrays().values())
     for name, array in scenario.arrays().items():
         header = _names(grid, name)
         file = folder / f"{name}ed.csv.bz2" if name.endswith("_forecast") else folder / f"{name}.csv.bz2"
         with bz2.open(file, "wt", encoding="ascii", newline="\n") as stream:
             stream.write(";".join(header) + "\n")
-            # Horizons of one row follow each other.
-            stream.writelines(_lines(array.reshape(-1, array.shape[-1])))
+            table = array.reshape(-1, array.shape[-1])  # Horizons of one row follow each other.
+            for first in range(0, len(table), _CHUNK):
+                chunk = table[first : first + _CHUNK]
+                stream.write(_lines(chunk))
+                done += chunk.size
+                report(done, total)
     (folder / "start_datetime.info").write_text(f"{scenario.start_datetime:%Y-%m-%d %H:%M}\n")
     (folder / "time_interval.info").write_text("00:05\n")
     config = maintenance_of(grid, scenario)
@@ -64,11 +70,9 @@ def _write_files(grid: Grid, scenario: Scenario, folder: Path) -> None:
         (folder / "maintenance_meta.json").write_text(json.dumps(_maintenance_rules(grid, config), indent=1) + "\n")
 
 
-def _lines(table: NDArray[Any]) -> Iterator[str]:
-    for first in range(0, len(table), _CHUNK):
-        chunk = table[first : first + _CHUNK]
-        words = chunk.astype(np.int8).astype(str) if chunk.dtype == np.bool_ else chunk.astype(str)
-        yield "\n".join(";".join(row) for row in words.tolist()) + "\n"
+def _lines(chunk: NDArray[Any]) -> str:
+    words = chunk.astype(np.int8).astype(str) if chunk.dtype == np.bool_ else chunk.astype(str)
+    return "\n".join(";".join(row) for row in words.tolist()) + "\n"
 
 
 def _names(grid: Grid, array: str) -> Sequence[str]:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import bz2
 import hashlib
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
+from rl2grid.scenarios.progress import Report, ignore
 
 _REQUIRED = ("load_p", "load_q", "prod_p")
 _OPTIONAL = ("prod_v", "load_p_forecasted", "load_q_forecasted", "prod_p_forecasted", "prod_v_forecasted")
@@ -36,6 +36,9 @@ RENEWABLE_TOLERANCE = 1.0
 (l2rpn_icaps_2021), so only values that no plant could mean are refused."""
 _ZERO = 1e-7
 """What Grid2Op takes for zero in an outage file."""
+
+_CHUNK = 2048
+"""Rows that are parsed at once."""
 
 Matrix = NDArray[np.float64]
 
@@ -65,7 +68,12 @@ def source_key(grid: Grid, *paths: Path) -> str:
 
 
 def read_folder(
-    grid: Grid, path: Path, *, by_substation: bool = False, signed_loads: Sequence[int] | None = None
+    grid: Grid,
+    path: Path,
+    *,
+    by_substation: bool = False,
+    signed_loads: Sequence[int] | None = None,
+    report: Report = ignore,
 ) -> FolderContent:
     """The series in the folder ``path``.
 
@@ -77,13 +85,14 @@ def read_folder(
             generators that the series lacks stay at 0 MW, and what belongs to the other grid alone
             (voltages, outages) is left out.
         signed_loads: Loads that may be negative (interconnections); None: all of them.
+        report: told how many bytes of the files were read.
 
     Raises:
         UsageError: A file, a column or a value is missing or impossible.
     """
     if not path.is_dir():
         raise UsageError(f"There is no scenario folder {path}.")
-    reader = _Reader(grid, path, by_substation)
+    reader = _Reader(grid, path, by_substation, report)
     arrays: dict[str, NDArray[Any]] = {}
     for name in _REQUIRED + _OPTIONAL + _OUTAGES:
         if by_substation and name in _OF_ONE_GRID:
@@ -100,17 +109,19 @@ def read_folder(
     reader.refuse_hazards(arrays.pop("hazards", None))
     reader.check_loads(arrays["load_p"], signed_loads)
     reader.check_generation(arrays["prod_p"])
-    return FolderContent(_start_datetime(path), arrays)
+    return FolderContent(read_start(path), arrays)
 
 
 class _Reader:
     """Reads the files of one folder and remembers how many rows they must have."""
 
-    def __init__(self, grid: Grid, path: Path, by_substation: bool) -> None:
+    def __init__(self, grid: Grid, path: Path, by_substation: bool, report: Report) -> None:
         self._grid = grid
         self._path = path
         self._by_substation = by_substation
+        self._report = report
         self._rows = 0
+        self._bytes_read, self._bytes = 0, sum(file.stat().st_size for file in _files(path))
 
     def read(self, name: str) -> Matrix | None:
         """The file called ``name`` in grid order, or None where an optional file is absent."""
@@ -119,12 +130,22 @@ class _Reader:
             if name in _REQUIRED:
                 raise UsageError(f"File {self._path / name}.csv (or .csv.bz2) is missing from the scenario folder.")
             return None
-        header, matrix = _parse(file)
+        header, matrix = _parse(file, self._report_part(file))
         self._check_length(name, file, len(matrix))
         order = self._order(name, file, header)
         result = np.zeros((len(matrix), len(self._names(name))))
         result[:, order] = matrix
         return result
+
+    def _report_part(self, file: Path) -> Report:
+        """Of a file; what is told on are bytes of the folder."""
+        before, size = self._bytes_read, file.stat().st_size
+        self._bytes_read += size
+
+        def report_rows(done: int, total: int) -> None:
+            self._report(before + size * done // total, self._bytes)
+
+        return report_rows
 
     def forecast(self, matrix: Matrix) -> NDArray[np.float32]:
         """[rows * horizon, n] to [rows, horizon, n]: the horizons of one row follow each other."""
@@ -206,22 +227,26 @@ class _Reader:
         return int(found[0]) if len(found) else None
 
 
-def _parse(file: Path) -> tuple[list[str], Matrix]:
-    """Header and values of a semicolon-separated file."""
+def _parse(file: Path, report: Report) -> tuple[list[str], Matrix]:
+    """Header and values of a semicolon-separated file; ``report`` is told of its rows."""
     try:
         raw = bz2.decompress(file.read_bytes()) if file.suffix == ".bz2" else file.read_bytes()
         header_line, _, body = raw.decode().partition("\n")
     except (OSError, ValueError, EOFError) as error:
         raise UsageError(f"File {file} cannot be read ({error}): a complete CSV file is needed.") from error
     header = [column.strip() for column in header_line.split(";")]
-    if not body.strip():
-        return header, np.zeros((0, len(header)))
-    try:
-        matrix = np.loadtxt(io.StringIO(body), delimiter=";", ndmin=2, comments=None)
-    except ValueError:
-        matrix = None
-    if matrix is None or matrix.shape[1] != len(header) or not np.isfinite(matrix).all():
-        raise _bad_cell(file, header, body)
+    lines = [line for line in body.splitlines() if line and not line.isspace()]
+    matrix = np.zeros((len(lines), len(header)))
+    for first in range(0, len(lines), _CHUNK):
+        part = slice(first, min(first + _CHUNK, len(lines)))
+        try:
+            values = np.loadtxt(lines[part], delimiter=";", ndmin=2, comments=None)
+        except ValueError:
+            values = None
+        if values is None or values.shape[1] != len(header) or not np.isfinite(values).all():
+            raise _bad_cell(file, header, body)
+        matrix[part] = values
+        report(part.stop, len(lines))
     return header, matrix
 
 
@@ -246,8 +271,12 @@ def _is_number(cell: str) -> bool:
         return False
 
 
-def _start_datetime(path: Path) -> datetime:
-    """The folder's first time stamp, once its rows are known to be 5 minutes apart."""
+def read_start(path: Path) -> datetime:
+    """The first time stamp of a scenario folder, once its rows are known to be 5 minutes apart.
+
+    Raises:
+        UsageError: They are not, or there is no time stamp.
+    """
     start, interval = ((path / name) for name in _INFOS)
     if not start.is_file():
         raise UsageError(f"File {start} is missing from the scenario folder.")

@@ -19,10 +19,11 @@ from dataclasses import fields
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import filelock
 import numpy as np
+from numpy.typing import NDArray
 
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid, MaintenanceConfig, load_grid
@@ -35,18 +36,22 @@ from rl2grid.streams import Purpose, Stream
 if TYPE_CHECKING:
     from rl2grid.scenarios.generator.month import RawMonth
 
-VERSION = "draft"
-"""Version of the generator, named by every result on generated months. As long as it is ``draft``, a name may stand
-for other values after an update; the pack hash, which results name too, tells."""
+VERSION = "1"
+"""Version of the generator, named by every result on generated months: it changes with any value that is generated.
+The hashes of the months of validation and test are published with it (:mod:`rl2grid.scenarios.published`)."""
 
 MONTHS = 12
-EPISODES_PER_YEAR = 12
-"""Training episodes in a row that play the same year: making one month takes as long as making its year."""
+SEEDS_PER_YEAR, EPISODES_PER_YEAR = 16, 12
+"""How many seeds in a row, and how many training episodes of each in a row, play the same year (from rows of their
+own): making one month takes as long as making its year, and environments of a vector have seeds in a row."""
 
 EXPANDED_BYTES = 8 * 2**30
 """Expanded generated months beyond this are removed, oldest first; they are expanded again when needed."""
 TRAINING_PACK_BYTES = 2 * 2**30
 """Packs of a grid's training years beyond this are removed, oldest first."""
+
+_POWER_FLOW = ("ac", "bits", "borrowing", "factors", "flow_state", "model", "newton", "ordering", "topology")
+"""Modules of :mod:`rl2grid.powerflow` that decide what is generated."""
 
 _NAME = re.compile(r"(?P<seed>0|[1-9]\d{0,18})-(?P<month>\d\d)(\+(?P<next>\d\d))?")
 _LOCKS = 64
@@ -90,7 +95,7 @@ def month_name(seed: int, month: int) -> str:
 
 def draw_training_months(seed: int, number: int) -> str:
     """Name of the two months in a row in which training episode ``number`` of ``seed`` is played."""
-    year = Stream(seed, number // EPISODES_PER_YEAR, Purpose.SCENARIO).integer(TRAINING_SEEDS)
+    year = Stream(seed // SEEDS_PER_YEAR, number // EPISODES_PER_YEAR, Purpose.SCENARIO).integer(TRAINING_SEEDS)
     # The second number of the stream: the first may be the one that draws a year.
     month = int(Stream(seed, number, Purpose.SCENARIO).uniform(2)[1] * (MONTHS - 1))
     return f"{month_name(FIRST_TRAINING_SEED + year, month)}+{month + 1:02d}"
@@ -128,7 +133,7 @@ def generator_fingerprint(grid: Grid) -> str:
     """Short hash of everything that decides what the generator makes for ``grid``."""
     package = resources.files("rl2grid")
     sources = [
-        *_python_files(package / "powerflow"),
+        *(package / "powerflow" / f"{module}.py" for module in _POWER_FLOW),
         *_python_files(package / "scenarios" / "generator"),
         package / "scenarios" / "packs.py",
         package / "scenarios" / "generator" / "data" / f"{grid.id}.json",
@@ -203,14 +208,16 @@ def _content(grid: Grid, months: Months) -> FolderContent:
             TRAINING_PACK_BYTES,
         )
     parts = [generator.arrays_of(grid, each) for each in raw]
-    # In the order of an imported folder, so that hashes agree. The last row of a month is the first of the next one,
-    # which knows the forecasts made in it.
-    joined = {
-        field.name: np.concatenate([*(part[field.name][:-1] for part in parts[:-1]), parts[-1][field.name]])
-        for field in fields(Scenario)
-        if field.name in parts[0]
-    }
-    return FolderContent(generator.start_of(raw[0]), joined)
+    if len(parts) == 1:
+        return FolderContent(generator.start_of(raw[0]), _in_order(parts[0]))
+    # The last row of a month is the first of the next one, which knows the forecasts made in it.
+    joined = {name: np.concatenate([*(part[name][:-1] for part in parts[:-1]), parts[-1][name]]) for name in parts[0]}
+    return FolderContent(generator.start_of(raw[0]), _in_order(joined))
+
+
+def _in_order(arrays: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """``arrays`` in the order of an imported folder, so that hashes agree."""
+    return {field.name: arrays[field.name] for field in fields(Scenario) if field.name in arrays}
 
 
 def _read_or_make(grid: Grid, seed: int, months: Sequence[int]) -> list[RawMonth]:

@@ -12,7 +12,7 @@ from rl2grid.scenarios.cache import data_folder
 from rl2grid.scenarios.full import full_data_folder
 from rl2grid.scenarios.generated import pack_folder, pack_path, parse_months
 from rl2grid.scenarios.imported import imported_folder, imported_names
-from rl2grid.scenarios.splits import GENERATED_SPLITS
+from rl2grid.scenarios.splits import HELD_OUT_SPLITS
 
 CACHES = ("series", "packs")
 """Folders below the data folder whose content is made again when needed."""
@@ -72,7 +72,7 @@ def _generated(grid: Grid) -> list[Holding]:
         return []
     seeds = {parse_months(path.stem).seed for path in packs}
     parts = [f"{len(packs):,} months, seeds {_some(tuple(map(str, sorted(seeds))))}"]
-    for split, names in GENERATED_SPLITS.items():
+    for split, names in HELD_OUT_SPLITS.items():
         months = [parse_months(name) for name in names]
         made = sum(pack_path(grid, each.seed, each.first).is_file() for each in months)
         if made:

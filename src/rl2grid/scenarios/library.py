@@ -1,13 +1,12 @@
 """Scenarios by name: which ones a split holds, and their content.
 
 An id is ``source/series`` or, for a window of the series, ``source/series[first:past the last]``.
-The source ``bundled`` is inside the Grid2Op wheel. The source ``full`` is Grid2Op's downloadable
-dataset where the user has it: ``$RL2GRID_FULL_DATA`` names the folder that holds it (the one with
-``l2rpn_case14_sandbox`` and its like inside), and its being set is the request to split it instead
-of the bundled series. The split ``bundled`` is every bundled series from beginning to end, in
-either case. The source ``generated`` is the generator, of which ``generated-train``,
-``generated-validation`` and ``generated-test`` are splits of their own; the source ``folder`` is
-what the user has imported.
+The source ``generated`` is the generator: training, validation and test play its months
+(:mod:`rl2grid.scenarios.splits`). The source ``bundled`` is inside the Grid2Op wheel; the split of that name is every
+bundled series from beginning to end. The source ``full`` is Grid2Op's downloadable dataset where the user has it:
+``$RL2GRID_FULL_DATA`` names the folder that holds it (the one with ``l2rpn_case14_sandbox`` and its like inside), and
+its being set is the request to train, validate and test on it instead. The source ``folder`` is what the user has
+imported.
 """
 
 from __future__ import annotations
@@ -15,30 +14,36 @@ from __future__ import annotations
 import functools
 import hashlib
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 from rl2grid.errors import UsageError, one_of
 from rl2grid.grids import Grid, load_grid
 from rl2grid.scenarios.bundled import bundled_folders, interconnections, load_bundled
-from rl2grid.scenarios.cache import CachedSeries, cached_series, data_folder
-from rl2grid.scenarios.folder import read_folder, source_key
-from rl2grid.scenarios.full import full_data_folder, full_folders, full_split, is_full_requested
-from rl2grid.scenarios.generated import EPISODES_PER_YEAR, VERSION, is_training_seed, load_generated, parse_months
+from rl2grid.scenarios.cache import CachedSeries, data_folder
+from rl2grid.scenarios.folder import read_folder
+from rl2grid.scenarios.full import full_data_folder, full_folders, full_split, is_full_requested, load_full
+from rl2grid.scenarios.generated import (
+    EPISODES_PER_YEAR,
+    SEEDS_PER_YEAR,
+    VERSION,
+    draw_training_months,
+    is_training_seed,
+    load_generated,
+    parse_months,
+)
 from rl2grid.scenarios.imported import imported_names, load_imported, store_imported
+from rl2grid.scenarios.progress import Report, ignore
+from rl2grid.scenarios.published import warn_of_deviation
 from rl2grid.scenarios.scenario import Scenario
 from rl2grid.scenarios.splits import (
-    BUNDLED_SPLITS,
+    BUNDLED,
     FIRST_TRAINING_SEED,
-    GENERATED_SPLITS,
-    GENERATED_TRAINING,
+    HELD_OUT_SPLITS,
+    SPLITS,
+    TRAIN,
     TRAINING_SEEDS,
 )
-
-RECORDED_SPLITS = ("train", "validation", "test", "bundled")
-"""``train`` teaches, ``validation`` picks models, ``test`` has the final word, ``bundled`` is every bundled series."""
-
-SPLITS = (*RECORDED_SPLITS, GENERATED_TRAINING, *GENERATED_SPLITS)
-"""All of them; those of generated months have the same purposes."""
 
 SOURCES = ("bundled", "full", "generated", "folder")
 
@@ -54,32 +59,31 @@ def list_scenarios(grid_id: str, split: str) -> tuple[str, ...]:
     """
     grid = load_grid(grid_id)
     _check_split(split)
-    if split == GENERATED_TRAINING:
+    if split == BUNDLED:
+        return tuple(f"bundled/{name}" for name in bundled_folders(grid))
+    if is_full_requested():
+        return tuple(f"full/{name}" for name in full_split(grid, split))
+    if split == TRAIN:
         raise UsageError(
             f"The split {split} has no end, and its months cannot be listed: choose one of "
             f"{', '.join(other for other in SPLITS if other != split)}."
         )
-    if split in GENERATED_SPLITS:
-        return tuple(f"generated/{name}" for name in GENERATED_SPLITS[split])
-    if split == "bundled":
-        return tuple(f"bundled/{name}" for name in bundled_folders(grid))
-    if is_full_requested():
-        return tuple(f"full/{name}" for name in full_split(grid, split))
-    return tuple(f"bundled/{window}" for window in BUNDLED_SPLITS[grid_id][split])
+    return tuple(f"generated/{name}" for name in HELD_OUT_SPLITS[split])
 
 
 def check_in_split(grid_id: str, split: str, scenario_id: str) -> None:
-    """Refuse a scenario that is not in a split.
+    """Refuse a scenario that is not in a split, and is no window of one that is.
 
     Raises:
         UsageError: It is not, or unknown grid or split.
     """
     _check_split(split)
-    if split == GENERATED_TRAINING:
-        _check_training_months(load_grid(grid_id), scenario_id)
+    series = scenario_id.partition("[")[0]
+    if split == TRAIN and not is_full_requested():
+        _check_training_months(load_grid(grid_id), series)
         return
     ids = list_scenarios(grid_id, split)
-    if scenario_id not in ids:
+    if series not in ids:
         listed = ", ".join(ids[:_LISTED]) + (f" or {len(ids) - _LISTED} more" if len(ids) > _LISTED else "")
         raise UsageError(f"Scenario {scenario_id!r} is not in the split {split} of {grid_id}: choose one of {listed}.")
 
@@ -96,39 +100,40 @@ def load_scenario(grid_id: str, scenario_id: str) -> Scenario:
     return _load_scenario(grid, scenario_id, data_folder(), full_data_folder())
 
 
-def import_folder(grid: Grid, path: Path) -> Scenario:
+def import_folder(grid: Grid, path: Path, report: Report = ignore) -> Scenario:
     """Any Grid2Op scenario folder as a scenario of ``grid``, checked and copied to the data folder.
 
-    Its id is ``folder/<name of the folder>``; an earlier import of that name is replaced.
+    Its id is ``folder/<name of the folder>``; an earlier import of that name is replaced. ``report`` is told how many
+    bytes of its files were read.
 
     Raises:
         UsageError: A file, a column or a value is missing or impossible; nothing is imported then.
     """
     # A folder may be given as `.` or through a link.
     path = path.resolve()
-    store_imported(grid, path.name, read_folder(grid, path, signed_loads=interconnections(grid)))
+    store_imported(grid, path.name, read_folder(grid, path, signed_loads=interconnections(grid), report=report))
     # The name may have stood for another series before.
     _load_scenario.cache_clear()
     _load_series.cache_clear()
     return load_scenario(grid.id, f"folder/{path.name}")
 
 
-def scenario_pack_hash(grid_id: str, split: str) -> str:
-    """Short hash of every value of every scenario of a split.
+def scenario_pack_hash(grid_id: str, split: str, scenarios: Sequence[str] | None = None) -> str:
+    """Short hash of every value of scenarios of a split: of those given, else of all.
 
-    Of generated months it begins with the version of the generator, as in ``draft-0123456789abcdef``; of those that
-    training draws it covers the rule by which they are drawn and the first month of the validation split.
+    Of generated months it begins with the version of the generator, as in ``1-0123456789abcdef``. Training has no end:
+    without ``scenarios``, its hash covers the rule by which months are drawn and the first month that training with
+    seed 0 plays.
 
     Raises:
-        UsageError: Unknown grid or split.
+        UsageError: Unknown grid, split or scenario.
     """
+    _check_split(split)
     digest = hashlib.sha256()
-    if split == GENERATED_TRAINING:
-        digest.update(f"{FIRST_TRAINING_SEED} {TRAINING_SEEDS} {EPISODES_PER_YEAR}\n".encode())
-        ids = list_scenarios(grid_id, "generated-validation")[:1]
-    else:
-        ids = list_scenarios(grid_id, split)
-    for scenario_id in ids:
+    if scenarios is None and split == TRAIN and not is_full_requested():
+        digest.update(f"{FIRST_TRAINING_SEED} {TRAINING_SEEDS} {SEEDS_PER_YEAR} {EPISODES_PER_YEAR}\n".encode())
+        scenarios = [f"generated/{draw_training_months(0, 0)}"]
+    for scenario_id in list_scenarios(grid_id, split) if scenarios is None else scenarios:
         digest.update(f"{scenario_id} {load_scenario(grid_id, scenario_id).content_hash}\n".encode())
     version = generator_version(split)
     return digest.hexdigest()[:16] if version is None else f"{version}-{digest.hexdigest()[:16]}"
@@ -136,7 +141,7 @@ def scenario_pack_hash(grid_id: str, split: str) -> str:
 
 def generator_version(split: str) -> str | None:
     """Version of what generated the scenarios of a split; None: they are recorded ones."""
-    return None if split in RECORDED_SPLITS else VERSION
+    return None if split == BUNDLED or is_full_requested() else VERSION
 
 
 def _check_split(split: str) -> None:
@@ -149,7 +154,7 @@ def _check_training_months(grid: Grid, scenario_id: str) -> None:
     if source == "generated" and is_training_seed(parse_months(name).seed):
         return
     raise UsageError(
-        f"Scenario {scenario_id!r} is not in the split {GENERATED_TRAINING} of {grid.id}: choose one such as "
+        f"Scenario {scenario_id!r} is not in the split {TRAIN} of {grid.id}: choose one such as "
         f"generated/{FIRST_TRAINING_SEED}-03, with a seed of at least {FIRST_TRAINING_SEED}."
     )
 
@@ -176,6 +181,7 @@ def _find_scenario(grid: Grid, scenario_id: str, data: Path, full_data: Path) ->
         )
     if match["source"] == "generated":
         whole = _scenario(grid, "generated", match["series"], load_generated(grid, match["series"]))
+        warn_of_deviation(whole)
     else:
         whole = _load_series(grid, match["source"], match["series"], data, full_data)
     if match["start"] is None:
@@ -196,21 +202,12 @@ def _load_series(grid: Grid, source: str, name: str, data: Path, full_data: Path
                 f"Scenario folder/{name} of {grid.id} was not imported: `rl2grid data import {grid.id} FOLDER` does it."
             )
         return _scenario(grid, source, name, load_imported(grid, name))
-    folders = bundled_folders(grid) if source == "bundled" else full_folders(grid)
-    if name not in folders:
-        raise one_of(f"Scenario of {grid.id}", f"{source}/{name}", _shortened([f"{source}/{name}" for name in folders]))
+    names = tuple(bundled_folders(grid) if source == "bundled" else full_folders(grid))
+    if name not in names:
+        raise one_of(f"Scenario of {grid.id}", f"{source}/{name}", _shortened([f"{source}/{each}" for each in names]))
     if source == "bundled":
         return _scenario(grid, source, name, load_bundled(grid, name))
-    return _scenario(grid, source, name, _load_folder(grid, source, name, folders[name]))
-
-
-def _load_folder(grid: Grid, source: str, name: str, path: Path) -> CachedSeries:
-    return cached_series(
-        grid.id,
-        f"{source}.{name}",
-        source_key(grid, path),
-        lambda: read_folder(grid, path, signed_loads=interconnections(grid)),
-    )
+    return _scenario(grid, source, name, load_full(grid, name))
 
 
 def _scenario(grid: Grid, source: str, name: str, series: CachedSeries) -> Scenario:

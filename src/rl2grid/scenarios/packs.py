@@ -3,7 +3,7 @@
 A pack is a line of JSON and a compressed body. The body holds what the month is made of, integers of 0.1 MW and
 0.1 MVAr, column by column as differences from row to row; reactive demand as what differs from 0.7 of active demand,
 which is nothing for ordinary loads. Forecasts and voltages follow from the grid, the seed and the month, and are made
-when a pack is read. What was read once is kept in the data folder as arrays that processes map into memory and share.
+when a pack is expanded.
 """
 
 from __future__ import annotations
@@ -18,17 +18,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rl2grid.compile import jit
 from rl2grid.errors import UsageError
-from rl2grid.grids import Grid, load_grid
-from rl2grid.scenarios.cache import cached_series
-from rl2grid.scenarios.folder import FolderContent
+from rl2grid.grids import load_grid
 from rl2grid.scenarios.generator.calendar import MONTH_ROWS
 from rl2grid.scenarios.generator.constants import load_constants
-from rl2grid.scenarios.generator.month import RawMonth, arrays_of, scenario_id, start_of
-from rl2grid.scenarios.scenario import Scenario
+from rl2grid.scenarios.generator.month import RawMonth
 
 I16 = NDArray[np.int16]
-I32 = NDArray[np.int32]
+U8 = NDArray[np.uint8]
 
 FORMAT = "rl2grid-pack-1"
 SUFFIX = ".pack"
@@ -65,52 +63,16 @@ def read_raw(path: Path) -> RawMonth:
     widths = (grid.n_load, grid.n_load, grid.n_gen)
     if rows != MONTH_ROWS + int(load_constants(grid.id).forecast.horizon[0]):
         raise UsageError(f"Pack {path} has {rows} rows, which no month of {grid.id} has: make it again.")
-    flat = np.frombuffer(zlib.decompress(body), np.uint8).astype(np.uint16)
+    flat = np.frombuffer(zlib.decompress(body), np.uint8)
     if flat.size != 2 * rows * sum(widths):
         raise UsageError(f"Pack {path} does not hold a month of {grid.id}: make it again.")
-    matrices, first = [], 0
-    for width in widths:
-        matrices.append(_rows(flat[first : first + 2 * rows * width], rows, width))
-        first += 2 * rows * width
-    load_p, difference, prod_p = matrices
-    load_q = (difference + _usual_reactive(load_p.astype(np.int32))).astype(np.int16)
+    load_p, load_q, prod_p = (np.empty((rows, width), np.int16) for width in widths)
+    ends = 2 * rows * np.cumsum(widths)
+    _decode(flat[: ends[0]], load_p)
+    _decode(flat[ends[0] : ends[1]], load_q)
+    _decode(flat[ends[1] :], prod_p)
+    _add_usual_reactive(load_p, load_q)
     return RawMonth(grid.id, header["seed"], header["month"], load_p, load_q, prod_p)
-
-
-def read_pack(path: Path) -> Scenario:
-    """The scenario in a pack, as read-only arrays in memory that processes share.
-
-    The arrays are made on the first call and kept in the data folder (:mod:`rl2grid.scenarios.cache`); a copy that is
-    damaged or missing is made again.
-
-    Raises:
-        UsageError: as :func:`read_raw`, or the data folder cannot be written.
-    """
-    header, _ = _open(path)
-    grid = load_grid(header["grid"])
-    raw_name = f"generated.{header['seed']}-{header['month']:02d}"
-    series = cached_series(grid.id, raw_name, _key(grid, header), lambda: _content(grid, read_raw(path)))
-    return Scenario(
-        id=scenario_id(header["seed"], header["month"]),
-        grid_id=grid.id,
-        source="generated",
-        start_datetime=series.start_datetime,
-        content_hash=series.content_hash,
-        first_row=0,
-        series_rows=len(series.arrays["load_p"]),
-        **series.arrays,
-    )
-
-
-def _content(grid: Grid, raw: RawMonth) -> FolderContent:
-    return FolderContent(start_of(raw), arrays_of(grid, raw))
-
-
-def _key(grid: Grid, header: dict[str, Any]) -> str:
-    """Everything that the arrays of a pack depend on."""
-    return hashlib.sha256(
-        f"{FORMAT} {grid.hash} {load_constants(grid.id).hash} {header['sha256']}".encode()
-    ).hexdigest()
 
 
 def _open(path: Path) -> tuple[dict[str, Any], bytes]:
@@ -129,26 +91,35 @@ def _open(path: Path) -> tuple[dict[str, Any], bytes]:
 
 
 def _matrices(raw: RawMonth) -> tuple[I16, I16, I16]:
-    difference = raw.load_q - _usual_reactive(raw.load_p.astype(np.int32))
-    return raw.load_p, difference.astype(np.int16), raw.prod_p
+    difference = raw.load_q.copy()
+    _add_usual_reactive(raw.load_p, difference, -1)
+    return raw.load_p, difference, raw.prod_p
 
 
-def _usual_reactive(active: I32) -> I32:
-    """0.7 of ``active``, halves upwards."""
-    return (7 * active + 5) // 10
+@jit
+def _add_usual_reactive(active: I16, reactive: I16, sign: int = 1) -> None:
+    """Add 0.7 of ``active``, halves upwards."""
+    for row in range(active.shape[0]):
+        for load in range(active.shape[1]):
+            reactive[row, load] += sign * ((7 * np.int32(active[row, load]) + 5) // 10)
 
 
 def _columns(matrix: I16) -> bytes:
     """Differences down the columns; low bytes of all, then high bytes: those of small numbers are alike."""
-    columns = matrix.T.astype(np.int32)
-    steps = np.diff(columns, axis=1, prepend=0)
-    zigzag = ((steps << 1) ^ (steps >> 31)).astype(np.uint16)
+    steps = np.diff(matrix.T, axis=1, prepend=np.int16(0))  # Modulo 2**16, as is their sum.
+    zigzag = ((steps << 1) ^ (steps >> 15)).astype(np.uint16)
     return (zigzag & 0xFF).astype(np.uint8).tobytes() + (zigzag >> 8).astype(np.uint8).tobytes()
 
 
-def _rows(data: NDArray[np.uint16], rows: int, width: int) -> I16:
-    half = rows * width
-    zigzag = (data[:half] | (data[half:] << 8)).astype(np.int32)
-    steps = (zigzag >> 1) ^ -(zigzag & 1)
-    matrix: I16 = np.ascontiguousarray(steps.reshape(width, rows).cumsum(axis=1).T.astype(np.int16))
-    return matrix
+@jit
+def _decode(data: U8, matrix: I16) -> None:
+    """The inverse of :func:`_columns`."""
+    rows, width = matrix.shape
+    high = rows * width
+    for column in range(width):
+        value = np.int32(0)
+        for row in range(rows):
+            place = column * rows + row
+            zigzag = np.int32(data[place]) | (np.int32(data[high + place]) << 8)
+            value += (zigzag >> 1) ^ -(zigzag & 1)
+            matrix[row, column] = value

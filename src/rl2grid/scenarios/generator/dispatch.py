@@ -17,7 +17,7 @@ from rl2grid.compile import jit
 from rl2grid.grids import Grid
 from rl2grid.scenarios.generator.calendar import ROWS_PER_DAY, seasonal
 from rl2grid.scenarios.generator.constants import Constants, SupplyConstants
-from rl2grid.scenarios.generator.draws import Channel, Draws
+from rl2grid.scenarios.generator.draws import Channel, Portion
 from rl2grid.scenarios.generator.fields import Field, new_independent_field, value
 
 F64 = NDArray[np.float64]
@@ -27,6 +27,12 @@ Bools = NDArray[np.bool_]
 
 _RAMP_SHARE = 9.8
 """Ramps in 0.1 MW keep 2 percent in hand: rounding must not break them."""
+_KEPT_PACE = 0.8
+"""Share of their ramps at which thermal units are expected to climb before a peak; some may be at their most."""
+_PASSES = 6
+"""How often rows are dispatched at most, each time with more reserve."""
+_MORE_RESERVE = 50
+"""Reserve beyond what was missing, 0.1 MW."""
 _LOWEST_PRICE, _HIGHEST_PRICE = -2.0, 6.0
 _HALVINGS = 34
 
@@ -41,113 +47,137 @@ class Market(NamedTuple):
     drift: Field  # noise of the price of each unit
 
 
-def new_market(grid: Grid, constants: Constants, seed: int, attempt: int, rows: int) -> Market:
-    """The generators of ``grid`` in one year."""
+def new_market(grid: Grid, constants: Constants, portion: Portion) -> Market:
+    """The generators of ``grid`` in a portion of a year."""
     supply = constants.supply
-    drift = new_independent_field(Draws(seed, attempt, Channel.PRICE), rows, ROWS_PER_DAY, len(supply.gen))
+    drift = new_independent_field(portion, Channel.PRICE, ROWS_PER_DAY, len(supply.gen))
     steepest = np.minimum(grid.gen_max_ramp_up, grid.gen_max_ramp_down)[supply.gen].astype(np.float64)
     kinds = np.array(grid.gen_type)[supply.gen]
     ramps = np.floor(_RAMP_SHARE * steepest).astype(np.int64)
     return Market(supply, ramps, kinds == "nuclear", kinds == "thermal", drift)
 
 
-@jit
-def dispatch(market: Market, first: int, stride: int, consumption: I64, production: I32) -> int:
+def dispatch(market: Market, first: int, stride: int, consumption: I64, reserve: I64, production: I32) -> int:
     """Dispatch rows ``first``, ``first + stride``, ... of a year; no ramp leads to the first.
 
     Where the generators cannot produce as little as asked, wind and sun are curtailed in proportion. Where they
     cannot produce as much, production falls short, and the slack generator will deliver the rest in the power flow.
-    Nuclear and thermal units foresee demand (:func:`_foresee`), so that ramps seldom lead to either.
+    Nuclear and thermal units foresee demand (:func:`_foresee`), so that ramps seldom lead to either; where production
+    falls short, the rows are dispatched again with more thermal production in reserve.
 
     Args:
         market: the generators.
         first: row of the year to which the first row of the arguments belongs.
         stride: rows of the year from one row of the arguments to the next; ramps allow as many steps.
         consumption: demand and losses, 0.1 MW, int64 [row].
+        reserve: production for which thermal units must be ready, 0.1 MW, int64 [row]; increased where that was needed.
         production: int32 [row, gen], 0.1 MW; wind and sun are given, the others are written.
 
     Returns:
         Energy that was not delivered, 0.1 MW rows.
     """
+    missing = np.zeros(consumption.size, np.int64)
+    available = production.copy()
+    for _ in range(_PASSES):
+        production[:] = available
+        _dispatch(market, first, stride, consumption, reserve, production, missing)
+        if not missing.any():
+            break
+        for row in range(missing.size):
+            if missing[row] > 0:
+                reserve[row] += missing[row] + _MORE_RESERVE
+    return int(missing.sum())
+
+
+@jit
+def _dispatch(
+    market: Market, first: int, stride: int, consumption: I64, reserve: I64, production: I32, missing: I64
+) -> None:
     supply, units = market.supply, market.supply.gen.size
-    low, high = np.empty(units, np.int64), np.empty(units, np.int64)
+    low, high, ceiling = np.empty(units, np.int64), np.empty(units, np.int64), np.empty(units, np.int64)
     floor, slope, begin = np.empty(units), np.empty(units), np.empty(units)
     power = np.empty(units, np.int64)
-    foreseen = _foresee(market, first, stride, consumption, production)
-    short = 0
+    foreseen = _foresee(market, first, stride, consumption, reserve, production)
     for k in range(consumption.size):
         row = first + k * stride
         asked = consumption[k]
         for gen in range(production.shape[1]):
             asked -= production[k, gen]
-        least = most = 0
+        least = usual = most = 0
         for unit in range(units):
             available = 10.0 * supply.high[unit] * seasonal(supply.guide[unit], row)
+            allowed = available
             if market.nuclear[unit]:
                 available *= foreseen[k, 0]
+                allowed = available
+            elif not market.thermal[unit]:
+                allowed *= foreseen[k, 1]
             floor[unit] = min(10.0 * supply.low[unit], available)
             slope[unit] = (available - floor[unit]) / supply.width[unit]
             begin[unit] = supply.begin[unit] + supply.wander[0] * value(market.drift, row, unit)
-            low[unit], high[unit] = np.int64(np.ceil(floor[unit])), np.int64(np.floor(available))
-            if market.thermal[unit]:
-                low[unit] = min(max(low[unit], np.int64(foreseen[k, 1] * available)), high[unit])
+            low[unit], ceiling[unit] = np.int64(np.ceil(floor[unit])), np.int64(np.floor(available))
+            high[unit] = np.int64(np.floor(allowed))
             if k > 0:
                 step = market.ramp[unit] * stride
                 low[unit] = max(low[unit], power[unit] - step)
+                ceiling[unit] = max(min(ceiling[unit], power[unit] + step), low[unit])
                 high[unit] = max(min(high[unit], power[unit] + step), low[unit])
             least += low[unit]
-            most += high[unit]
+            usual += high[unit]
+            most += ceiling[unit]
+        missing[k] = 0
         if asked < least:
             _curtail(production[k], least - asked)
             asked = least
         elif asked > most:
-            short += asked - most
+            missing[k] = asked - most
             asked = most
+        if asked > usual:
+            low[:] = high  # room that was made for thermal units is needed now
+            high[:] = ceiling
         _share(asked, floor, slope, begin, low, high, power)
         for unit in range(units):
             production[k, supply.gen[unit]] = power[unit]
-    return short
 
 
 @jit
-def _foresee(market: Market, first: int, stride: int, consumption: I64, production: I32) -> F64:
-    """Shares of their limits that nuclear units may and thermal units must produce to keep up with demand.
+def _foresee(market: Market, first: int, stride: int, consumption: I64, reserve: I64, production: I32) -> F64:
+    """Shares of their limits that nuclear units and the others but thermal units may produce at most.
 
-    Nuclear units come down before a valley, thermal units start before a peak that all others cannot meet.
+    Nuclear units come down before a valley. Before a peak that all others cannot meet, hydro units make room for
+    thermal units, which start as early as their ramps require.
 
     Returns:
-        float64 [row, 2]: most for nuclear units, least for thermal units (0 unless a peak is coming).
+        float64 [row, 2]: nuclear units; hydro units.
     """
     supply = market.supply
     nuclear = thermal = reserved = 0.0
-    nuclear_pace = thermal_pace = 1.0
+    nuclear_pace, thermal_pace = 1.0, 0.0
     for unit in range(supply.gen.size):
-        pace = market.ramp[unit] * stride / (10.0 * supply.high[unit])
         if market.nuclear[unit]:
             nuclear += 10.0 * supply.high[unit]
-            nuclear_pace = min(nuclear_pace, pace)
+            nuclear_pace = min(nuclear_pace, market.ramp[unit] * stride / (10.0 * supply.high[unit]))
         else:
             reserved += 10.0 * supply.low[unit]
         if market.thermal[unit]:
             thermal += 10.0 * supply.high[unit]
-            thermal_pace = min(thermal_pace, pace)
-    shares = np.zeros((consumption.size, 2))
+            thermal_pace += market.ramp[unit] * stride
+    shares = np.ones((consumption.size, 2))
     most, least = 1.0, 0.0
     for k in range(consumption.size - 1, -1, -1):
-        asked = consumption[k]
+        asked = float(consumption[k])
         for gen in range(production.shape[1]):
             asked -= production[k, gen]
         if nuclear > 0.0:
             most = min(most + nuclear_pace, 1.0, max((asked - reserved) / nuclear, 0.0))
-        others = nuclear * most
+        hydro = 0.0
         for unit in range(supply.gen.size):
             if not market.nuclear[unit] and not market.thermal[unit]:
-                others += 10.0 * supply.high[unit] * seasonal(supply.guide[unit], first + k * stride)
-        if thermal > 0.0:
-            now = min(max((asked - others) / thermal, 0.0), 1.0)
-            least = max(least - thermal_pace, now)
-            # What is needed now is shared out by price; only what a coming peak needs in advance is shared evenly.
-            shares[k, 1] = least - now
+                hydro += 10.0 * supply.high[unit] * seasonal(supply.guide[unit], first + k * stride)
+        needed = min(max(asked - nuclear * most - hydro, 0.0) + reserve[k], thermal)
+        least = max(least - _KEPT_PACE * thermal_pace, needed)
+        if least > needed and hydro > 0.0:
+            shares[k, 1] = min(max((asked - nuclear * most - least) / hydro, 0.0), 1.0)
         shares[k, 0] = most
     return shares
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,15 +32,30 @@ class Channel(enum.IntEnum):
 
 @dataclass(frozen=True)
 class Draws:
-    """The numbers of one channel of one month (0 where a whole year is drawn at once)."""
+    """The numbers of one channel, or of one part of it where a year is not drawn at once."""
 
     seed: int
     attempt: int
     """How many years of this seed were discarded before."""
     channel: Channel
-    month: int = 0
+    part: int = 0
 
     def uniform(self, size: int) -> NDArray[np.float64]:
         """``size`` numbers in [0, 1)."""
-        key = (self.attempt << 16) | (int(self.channel) << 8) | self.month
+        key = (self.attempt << 24) | (int(self.channel) << 16) | self.part
         return Stream(self.seed, key, Purpose.SERIES).uniform(size)
+
+
+class Portion(NamedTuple):
+    """Rows ``first`` to ``stop - 1`` of one possible year, drawn at once."""
+
+    seed: int
+    attempt: int
+    first: int
+    stop: int
+    part: int = 0
+    """Tells portions of the same year apart, whose numbers are independent."""
+
+    def draws(self, channel: Channel) -> Draws:
+        """The numbers of a channel."""
+        return Draws(self.seed, self.attempt, channel, self.part)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rl2grid.compile import jit
 from rl2grid.grids import Grid
 from rl2grid.scenarios.generator.arithmetic import gaussians
-from rl2grid.scenarios.generator.draws import Draws
+from rl2grid.scenarios.generator.draws import Channel, Portion
 
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
@@ -27,27 +27,32 @@ class Field(NamedTuple):
     """Noise of several elements."""
 
     knots: F64  # [knot, element]
+    first: int  # number of the first knot; knot 0 is that of row 0
     blend: F64  # [spacing, 4] weights of the four knots around a row
 
 
-def new_field(draws: Draws, rows: int, spacing: int, weights: F64) -> Field:
+def new_field(portion: Portion, channel: Channel, spacing: int, weights: F64) -> Field:
     """A field that varies over some ``spacing`` rows.
 
     Args:
-        draws: where its numbers come from.
-        rows: rows it must cover.
+        portion: rows it must cover.
+        channel: where its numbers come from.
         spacing: rows between two knots.
         weights: float64 [element, place], each row of unit length.
     """
-    count = rows // spacing + 4
-    places = gaussians(draws, count * weights.shape[1]).reshape(count, weights.shape[1])
-    return Field(_spread(places, weights), _blend(spacing))
+    places = _independent(portion, channel, spacing, weights.shape[1])
+    return Field(_spread(places, weights), portion.first // spacing, _blend(spacing))
 
 
-def new_independent_field(draws: Draws, rows: int, spacing: int, n: int) -> Field:
+def new_independent_field(portion: Portion, channel: Channel, spacing: int, n: int) -> Field:
     """A field of ``n`` elements that share nothing."""
-    count = rows // spacing + 4
-    return Field(gaussians(draws, count * n).reshape(count, n), _blend(spacing))
+    return Field(_independent(portion, channel, spacing, n), portion.first // spacing, _blend(spacing))
+
+
+def _independent(portion: Portion, channel: Channel, spacing: int, n: int) -> F64:
+    """The numbers of all knots that the rows of a portion need, float64 [knot, n]."""
+    count = portion.stop // spacing - portion.first // spacing + 4
+    return gaussians(portion.draws(channel), count * n).reshape(count, n)
 
 
 def neighbourly(grid: Grid, subs: I32) -> F64:
@@ -62,8 +67,8 @@ def neighbourly(grid: Grid, subs: I32) -> F64:
 def value(field: Field, row: int, element: int) -> float:
     """The noise of one element in one row."""
     spacing = field.blend.shape[0]
-    first = row // spacing
-    w = field.blend[row - first * spacing]
+    w = field.blend[row % spacing]
+    first = row // spacing - field.first
     knots = field.knots
     return float(
         w[0] * knots[first, element]

@@ -16,7 +16,7 @@ from rl2grid.grids import Grid
 from rl2grid.scenarios.generator.arithmetic import exponential, rounded, sine
 from rl2grid.scenarios.generator.calendar import ROWS_PER_DAY
 from rl2grid.scenarios.generator.constants import RenewableConstants
-from rl2grid.scenarios.generator.draws import Channel, Draws
+from rl2grid.scenarios.generator.draws import Channel, Draws, Portion
 from rl2grid.scenarios.generator.fields import Field, neighbourly, new_field, value
 
 F64 = NDArray[np.float64]
@@ -33,8 +33,9 @@ _SINE_TILT = 0.3978
 
 
 class Weather(NamedTuple):
-    """One possible wind and sun of a year, row by row."""
+    """One possible wind and sun, row by row."""
 
+    portion: Portion
     n_gen: int
     wind: float  # factor on the capacity factor of the wind model
     solar: float  # share of pmax under a clear sky at the zenith
@@ -51,16 +52,17 @@ class Weather(NamedTuple):
     cloud_hours: Field
 
 
-def new_weather(grid: Grid, known: RenewableConstants, seed: int, attempt: int, rows: int) -> Weather:
-    """The weather of attempt ``attempt`` at the year of a seed, for its first ``rows`` rows.
+def new_weather(grid: Grid, known: RenewableConstants, portion: Portion) -> Weather:
+    """The weather of a portion of a year.
 
     How much wind and sun the grid has (``mixes``) does not depend on the attempt.
     """
     kinds = np.array(grid.gen_type)
     winds, suns = np.flatnonzero(kinds == "wind"), np.flatnonzero(kinds == "solar")
     near_winds, near_suns = (neighbourly(grid, grid.gen_to_subid[gens]) for gens in (winds, suns))
-    mix = float(known.mixes[int(Draws(seed, 0, Channel.MIX).uniform(1)[0] * len(known.mixes))])
+    mix = float(known.mixes[int(Draws(portion.seed, 0, Channel.MIX).uniform(1)[0] * len(known.mixes))])
     return Weather(
+        portion,
         grid.n_gen,
         mix * float(known.wind[0]),
         mix * float(known.solar[0]),
@@ -70,17 +72,18 @@ def new_weather(grid: Grid, known: RenewableConstants, seed: int, attempt: int, 
         suns,
         grid.gen_pmax[winds].astype(np.float64),
         grid.gen_pmax[suns].astype(np.float64),
-        new_field(Draws(seed, attempt, Channel.WIND_WEEK), rows, _WEEK_ROWS, near_winds),
-        new_field(Draws(seed, attempt, Channel.WIND_HOURS), rows, _HOURS_ROWS, near_winds),
-        new_field(Draws(seed, attempt, Channel.WIND_GUSTS), rows, _GUST_ROWS, near_winds),
-        new_field(Draws(seed, attempt, Channel.SOLAR_DAY), rows, _CLOUD_DAY_ROWS, near_suns),
-        new_field(Draws(seed, attempt, Channel.SOLAR_HOURS), rows, _CLOUD_HOURS_ROWS, near_suns),
+        new_field(portion, Channel.WIND_WEEK, _WEEK_ROWS, near_winds),
+        new_field(portion, Channel.WIND_HOURS, _HOURS_ROWS, near_winds),
+        new_field(portion, Channel.WIND_GUSTS, _GUST_ROWS, near_winds),
+        new_field(portion, Channel.SOLAR_DAY, _CLOUD_DAY_ROWS, near_suns),
+        new_field(portion, Channel.SOLAR_HOURS, _CLOUD_HOURS_ROWS, near_suns),
     )
 
 
-def renewable_production(weather: Weather, first: int, stop: int) -> I32:
-    """Production of wind and sun in rows ``first`` to ``stop - 1``, 0.1 MW, int32 [row, gen]; others are 0."""
-    production = np.zeros((stop - first, weather.n_gen), np.int32)
+def renewable_production(weather: Weather) -> I32:
+    """Production of wind and sun of a portion, 0.1 MW, int32 [row, gen]; others are 0."""
+    first = weather.portion.first
+    production = np.zeros((weather.portion.stop - first, weather.n_gen), np.int32)
     _fill_wind(weather, first, production)
     _fill_sun(weather, first, production)
     return production

@@ -3,7 +3,7 @@
 A month must begin secure: no line may be loaded above its limit during its first day, in the reference topology. Where
 one does not, that day, with 6 hours of transition before and after, takes its weather, demand and exchanges from
 another year of the same seed, the first that is secure; after 16 of them each next one is made calmer. A year that
-cannot be repaired so, or whose power flow does not converge in every hour, is discarded.
+cannot be repaired so, or whose power flow does not converge in every half hour, is discarded.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from rl2grid.scenarios.generator.calendar import MONTH_STEPS, MONTHS, ROWS_PER_D
 from rl2grid.scenarios.generator.constants import Constants, load_constants
 from rl2grid.scenarios.generator.demand import active_demand, new_demand, reactive_demand
 from rl2grid.scenarios.generator.dispatch import Market, dispatch, new_market
+from rl2grid.scenarios.generator.draws import Portion
 from rl2grid.scenarios.generator.renewables import new_weather, renewable_production
 from rl2grid.scenarios.generator.security import assess
 
@@ -44,6 +45,8 @@ _SECURE = 0.99
 _PROBED = 0.97
 """Largest loading of a first day that is dispatched in quarters of an hour, before the real dispatch."""
 _QUARTER = 3
+_SAMPLE = 6
+"""Rows from one whose losses are solved for to the next."""
 _DAY_ROWS = ROWS_PER_DAY + 1
 
 
@@ -67,6 +70,15 @@ class _Injections(NamedTuple):
     prod_p: I32
 
 
+class _Sample(NamedTuple):
+    """What the power flow said of every sixth row."""
+
+    load_p: I32
+    prod_p: I32
+    losses: I64
+    reserve: I64  # [row of the year] thermal production that dispatch found to be needed
+
+
 class _Setting(NamedTuple):
     grid: Grid
     constants: Constants
@@ -86,7 +98,7 @@ def generate_year(grid: Grid, seed: int) -> Year:
         raise UsageError(f"Seed {seed!r} is no seed of a year: choose an integer from 0 to {MAX_SEED}.")
     constants = load_constants(grid.id)
     for attempt in range(_ATTEMPTS):
-        market = new_market(grid, constants, seed, attempt, _ROWS)
+        market = new_market(grid, constants, Portion(int(seed), attempt, 0, _ROWS))
         year = _attempt_year(_Setting(grid, constants, int(seed), attempt, market))
         if year is not None:
             for array in (year.load_p, year.load_q, year.prod_p):
@@ -96,17 +108,21 @@ def generate_year(grid: Grid, seed: int) -> Year:
 
 
 def _attempt_year(setting: _Setting) -> Year | None:
-    demand, renewables = _draw(setting, 0, 0, _ROWS)
+    demand, renewables = _draw(setting, Portion(setting.seed, setting.attempt << 8, 0, _ROWS))
     spares = np.zeros(MONTHS, np.int64)
     doubtful = np.arange(MONTHS)
+    sample: _Sample | None = None
+    series: _Injections | None = None
     for _ in range(_ROUNDS):
         for month in doubtful:
             if not _make_secure(setting, demand, renewables, spares, int(month)):
                 return None
-        series, short = _operate(setting, demand, renewables.copy())
-        if series is None:
+        sample = _sample_losses(setting, demand, renewables, sample)
+        if sample is None:
             return None
-        doubtful = np.flatnonzero([not _begins_secure(setting, series, month) for month in range(MONTHS)])
+        last = series
+        series, short = _operate(setting, demand, renewables, sample)
+        doubtful = np.array([m for m in range(MONTHS) if not _begins_secure(setting, series, last, m)], np.int64)
         if not len(doubtful):
             load_p, load_q, prod_p = (array.astype(np.int16) for array in series)
             return Year(load_p, load_q, prod_p, setting.attempt, tuple(spares.tolist()), short)
@@ -114,13 +130,10 @@ def _attempt_year(setting: _Setting) -> Year | None:
     return None
 
 
-def _draw(setting: _Setting, spare: int, first: int, stop: int) -> tuple[I32, I32]:
-    """Demand, wind and sun of a year of the seed; ``spare`` 0 is the one that is being made."""
-    grid, constants, seed = setting.grid, setting.constants, setting.seed
-    number = (setting.attempt << 8) | spare
-    demand = new_demand(grid, constants, seed, number, _ROWS)
-    weather = new_weather(grid, constants.renewables, seed, number, _ROWS)
-    return active_demand(demand, first, stop), renewable_production(weather, first, stop)
+def _draw(setting: _Setting, portion: Portion) -> tuple[I32, I32]:
+    """Demand, wind and sun of a portion of a year of the seed."""
+    renewables = renewable_production(new_weather(setting.grid, setting.constants.renewables, portion))
+    return active_demand(new_demand(setting.grid, setting.constants, portion), renewables), renewables
 
 
 def _make_secure(setting: _Setting, demand: I32, renewables: I32, spares: I64, month: int) -> bool:
@@ -138,7 +151,8 @@ def _looks_secure(setting: _Setting, demand: I32, renewables: I32, month: int) -
     load_p, prod_p = demand[rows], renewables[rows].copy()
     load_q = reactive_demand(setting.constants.demand, load_p)
     total = load_p.sum(axis=1, dtype=np.int64)
-    dispatch(setting.market, rows.start, _QUARTER, total + _usual_losses(setting, total), prod_p)
+    consumption = total + _usual_losses(setting, total)
+    dispatch(setting.market, rows.start, _QUARTER, consumption, np.zeros_like(total), prod_p)
     verdict = assess(setting.grid, setting.constants.voltage, load_p, load_q, prod_p)
     return verdict.converged and float(verdict.loading.max()) <= _PROBED
 
@@ -149,7 +163,8 @@ def _replace_days(setting: _Setting, demand: I32, renewables: I32, spares: I64, 
         begin = int(month) * MONTH_STEPS
         first, stop = max(begin - _TRANSITION, 0), begin + _DAY_ROWS + _TRANSITION
         spares[month] += 1
-        other_demand, other_renewables = _draw(setting, int(spares[month]), first, stop)
+        number = (setting.attempt << 8) | int(spares[month])
+        other_demand, other_renewables = _draw(setting, Portion(setting.seed, number, first, stop, int(month) + 1))
         calm = max(int(spares[month]) - _CALM_AFTER, 0)
         other_demand = other_demand * (1000 - _LESS_DEMAND * calm) // 1000
         other_renewables = other_renewables * (1000 - _LESS_RENEWABLES * calm) // 1000
@@ -168,18 +183,31 @@ def _fade(series: I32, other: I32, begin: int) -> None:
             series[row, k] = (mixed + _TRANSITION // 2) // _TRANSITION
 
 
-def _operate(setting: _Setting, load_p: I32, prod_p: I32) -> tuple[_Injections | None, int]:
-    """Dispatch a year into ``prod_p``, first by the hour to learn its losses; None where a flow does not converge."""
-    load_q = reactive_demand(setting.constants.demand, load_p)
+def _sample_losses(setting: _Setting, load_p: I32, renewables: I32, last: _Sample | None) -> _Sample | None:
+    """Losses of every sixth row, dispatched with the usual losses; None where a flow does not converge."""
     total = load_p.sum(axis=1, dtype=np.int64)
-    hours = slice(None, None, ROWS_PER_HOUR)
-    hourly = prod_p[hours].copy()
-    dispatch(setting.market, 0, ROWS_PER_HOUR, total[hours] + _usual_losses(setting, total[hours]), hourly)
-    verdict = assess(setting.grid, setting.constants.voltage, load_p[hours], load_q[hours], hourly)
+    prod_p, reserve = renewables.copy(), np.zeros_like(total)
+    dispatch(setting.market, 0, 1, total + _usual_losses(setting, total), reserve, prod_p)
+    sampled_p, sampled_g = load_p[::_SAMPLE].copy(), prod_p[::_SAMPLE].copy()
+    losses = np.zeros(len(sampled_p), np.int64)
+    new = np.arange(len(sampled_p))
+    if last is not None:
+        losses = last.losses.copy()
+        new = np.flatnonzero((sampled_p != last.load_p).any(axis=1) | (sampled_g != last.prod_p).any(axis=1))
+    load_q = reactive_demand(setting.constants.demand, sampled_p[new])
+    verdict = assess(setting.grid, setting.constants.voltage, sampled_p[new], load_q, sampled_g[new])
     if not verdict.converged:
-        return None, 0
-    short = dispatch(setting.market, 0, 1, total + _every_row(verdict.losses, len(total)), prod_p)
-    return _Injections(load_p, load_q, prod_p), int(short)
+        return None
+    losses[new] = verdict.losses
+    return _Sample(sampled_p, sampled_g, losses, reserve)
+
+
+def _operate(setting: _Setting, load_p: I32, renewables: I32, sample: _Sample) -> tuple[_Injections, int]:
+    """Dispatch a year with the losses of its sample; also returns the energy that was not delivered."""
+    prod_p, total = renewables.copy(), load_p.sum(axis=1, dtype=np.int64)
+    consumption = total + _every_row(sample.losses, len(total))
+    short = dispatch(setting.market, 0, 1, consumption, sample.reserve, prod_p)
+    return _Injections(load_p.copy(), reactive_demand(setting.constants.demand, load_p), prod_p), int(short)
 
 
 def _usual_losses(setting: _Setting, total: I64) -> I64:
@@ -187,18 +215,22 @@ def _usual_losses(setting: _Setting, total: I64) -> I64:
     return losses
 
 
-def _begins_secure(setting: _Setting, series: _Injections, month: int) -> bool:
-    day = slice(month * MONTH_STEPS, month * MONTH_STEPS + _DAY_ROWS)
-    verdict = assess(setting.grid, setting.constants.voltage, *(array[day] for array in series))
+def _begins_secure(setting: _Setting, series: _Injections, last: _Injections | None, month: int) -> bool:
+    """Whether the first day of a month is secure; ``last`` had other days, those that stayed were secure."""
+    rows = slice(month * MONTH_STEPS, month * MONTH_STEPS + _DAY_ROWS)
+    day = [array[rows] for array in series]
+    if last is not None and all(np.array_equal(new, old[rows]) for new, old in zip(day, last, strict=True)):
+        return True
+    verdict = assess(setting.grid, setting.constants.voltage, *day)
     return verdict.converged and float(verdict.loading.max()) <= _SECURE
 
 
 @jit
-def _every_row(hourly: I64, rows: int) -> I64:
-    """Straight lines between the hours, level after the last."""
+def _every_row(sampled: I64, rows: int) -> I64:
+    """Straight lines between the sampled rows, level after the last."""
     result = np.empty(rows, np.int64)
     for row in range(rows):
-        hour, part = row // ROWS_PER_HOUR, row % ROWS_PER_HOUR
-        after = min(hour + 1, hourly.size - 1)
-        result[row] = (hourly[hour] * (ROWS_PER_HOUR - part) + hourly[after] * part) // ROWS_PER_HOUR
+        before, part = row // _SAMPLE, row % _SAMPLE
+        after = min(before + 1, sampled.size - 1)
+        result[row] = (sampled[before] * (_SAMPLE - part) + sampled[after] * part) // _SAMPLE
     return result

@@ -1,0 +1,134 @@
+"""The held-out months that results are compared on, as they were published.
+
+The generator gives the same months everywhere; should a machine, a compiler or an edit make others, its results are
+not comparable with anybody's. ``manifest.json`` therefore holds a hash of every month of validation and test, by
+version of the generator and grid. A month that differs is played, with a warning.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import warnings
+from collections.abc import Iterable, Mapping
+from importlib import resources
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rl2grid.errors import UsageError
+from rl2grid.grids import Grid
+from rl2grid.scenarios.generated import VERSION, pack_path, parse_months
+from rl2grid.scenarios.scenario import Scenario
+from rl2grid.scenarios.splits import HELD_OUT_SPLITS
+
+Hashes = Mapping[str, str]
+"""SHA-256 of a month by its name, for example ``700003-09``."""
+
+MANIFEST = "manifest.json"
+_HASHED = ("load_p", "load_q", "prod_p")
+
+
+class DeviationWarning(UserWarning):
+    """A held-out month is not the one that was published."""
+
+
+class Deviation(NamedTuple):
+    """A held-out month that is not the one that was published."""
+
+    grid_id: str
+    name: str
+
+    def __str__(self) -> str:
+        return (
+            f"The month {self.name} of {self.grid_id} differs from the one published with version {VERSION} of the "
+            "generator: results on it are not comparable."
+        )
+
+
+class Comparison(NamedTuple):
+    """Months of this machine beside the published ones."""
+
+    months: int
+    """How many were compared."""
+    deviations: list[Deviation]
+
+
+def hash_of_series(load_p: NDArray[Any], load_q: NDArray[Any], prod_p: NDArray[Any]) -> str:
+    """SHA-256 of series as integers of 0.1 MW and 0.1 MVAr, which no floating-point unit has a say in.
+
+    Args:
+        load_p: demand, [row, load]: float32 in MW, or int16 in 0.1 MW.
+        load_q: reactive demand, likewise.
+        prod_p: scheduled generation, [row, gen], likewise.
+    """
+    digest = hashlib.sha256()
+    for name, array in zip(_HASHED, (load_p, load_q, prod_p), strict=True):
+        integers = array if array.dtype == np.int16 else np.rint(10 * array)
+        digest.update(f"{name} {integers.shape}".encode())
+        digest.update(np.ascontiguousarray(integers, "<i2").data)
+    return digest.hexdigest()
+
+
+def published_hashes(grid_id: str) -> Hashes:
+    """Hashes of the held-out months of a grid, as this version of the generator was published with them; none before
+    it is.
+    """
+    return _manifest().get(VERSION, {}).get(grid_id, {})
+
+
+def held_out_months() -> tuple[str, ...]:
+    """Names of the months of validation and test."""
+    return tuple(name for names in HELD_OUT_SPLITS.values() for name in names)
+
+
+def hash_pack(grid: Grid, name: str) -> str | None:
+    """Hash of the month called ``name`` in its pack; None where there is no sound one."""
+    # Imported where it is needed: compiling takes long, and comparing what is loaded compiles nothing.
+    from rl2grid.scenarios.generator.calendar import MONTH_ROWS
+    from rl2grid.scenarios.packs import read_raw
+
+    months = parse_months(name)
+    try:
+        raw = read_raw(pack_path(grid, months.seed, months.first))
+    except UsageError:
+        return None
+    return hash_of_series(raw.load_p[:MONTH_ROWS], raw.load_q[:MONTH_ROWS], raw.prod_p[:MONTH_ROWS])
+
+
+def compare_with_published(grid: Grid, names: Iterable[str]) -> Comparison:
+    """Compare the packs of months, those that are there, with what was published of them."""
+    published = published_hashes(grid.id)
+    found = {name: hash_pack(grid, name) for name in names if name in published}
+    made = {name: digest for name, digest in found.items() if digest is not None}
+    differing = [Deviation(grid.id, name) for name, digest in made.items() if digest != published[name]]
+    return Comparison(len(made), differing)
+
+
+def warn_of_deviation(scenario: Scenario) -> None:
+    """Warn if ``scenario`` is a held-out month that differs from the one published: once per grid and process."""
+    name = scenario.id.partition("/")[2]
+    expected = published_hashes(scenario.grid_id).get(name)
+    if expected is not None and hash_of_series(scenario.load_p, scenario.load_q, scenario.prod_p) != expected:
+        _warn_once(scenario.grid_id, str(Deviation(scenario.grid_id, name)))
+
+
+_warned: set[str] = set()
+
+
+def _warn_once(grid_id: str, message: str) -> None:
+    if grid_id in _warned:
+        return
+    _warned.add(grid_id)
+    warnings.warn(f"{message} `rl2grid data check {grid_id}` lists all that do.", DeviationWarning, stacklevel=2)
+
+
+@functools.cache
+def _manifest() -> Mapping[str, Mapping[str, Hashes]]:
+    """Hashes by version of the generator, grid and month."""
+    manifest: Mapping[str, Mapping[str, Hashes]] = json.loads(
+        (resources.files("rl2grid.scenarios") / MANIFEST).read_text()
+    )
+    return manifest
