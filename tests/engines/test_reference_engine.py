@@ -155,7 +155,7 @@ def test_equals_plain_grid2op_for_long(monkeypatch, grid_id, kind):
 def test_copies_are_independent():
     grid = load_grid("bus14")
     engine = ReferenceEngine(grid, 2)
-    scenario_id = list_scenarios("bus14", "train")[0]
+    scenario_id = list_scenarios("bus14", "bundled")[0]
     for i in range(2):
         engine.reset(i, EpisodePlan(0, 0, scenario_id, 0, 100))
     engine.step(0, full_catalogue(grid)[5])
@@ -168,7 +168,7 @@ def test_game_over_is_explained_and_blanked():
     """Cutting the transformer that carries the generator of substation 7 isolates it."""
     grid = load_grid("bus14")
     engine = ReferenceEngine(grid, 1)
-    engine.reset(0, EpisodePlan(0, 0, list_scenarios("bus14", "train")[0], 0, 100))
+    engine.reset(0, EpisodePlan(0, 0, list_scenarios("bus14", "bundled")[0], 0, 100))
     (line,) = np.flatnonzero((grid.line_or_to_subid == 7) | (grid.line_ex_to_subid == 7))
     engine.step(0, StepAction(int(ActionKind.SWITCH), int(line)))
     assert engine.state.terminated[0]
@@ -176,7 +176,7 @@ def test_game_over_is_explained_and_blanked():
     assert (engine.state.topo_vect[0] == -1).all()
     assert (engine.state.rho[0] == 0).all()
     # The environment is usable again.
-    engine.reset(0, EpisodePlan(0, 1, list_scenarios("bus14", "train")[0], 0, 100))
+    engine.reset(0, EpisodePlan(0, 1, list_scenarios("bus14", "bundled")[0], 0, 100))
     assert not engine.state.terminated[0]
     assert engine.state.rho[0].max() > 0
 
@@ -184,7 +184,7 @@ def test_game_over_is_explained_and_blanked():
 def test_simulate_leaves_the_state_untouched():
     grid = load_grid("bus14")
     engine = ReferenceEngine(grid, 1)
-    engine.reset(0, EpisodePlan(0, 0, list_scenarios("bus14", "train")[0], 0, 100))
+    engine.reset(0, EpisodePlan(0, 0, list_scenarios("bus14", "bundled")[0], 0, 100))
     before = [np.copy(array) for array in engine.state]
     simulated = engine.simulate(0, full_catalogue(grid)[5], 1)
     assert not np.array_equal(simulated.topo_vect[0], engine.state.topo_vect[0])

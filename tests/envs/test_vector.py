@@ -126,7 +126,7 @@ def test_refused_action_steps_no_environment():
 
 def test_refusals_of_a_worker_arrive_as_one_sentence():
     vector = make_vector(2, 2)
-    with pytest.raises(UsageError, match="is not in the split train of bus14: choose one of"):
+    with pytest.raises(UsageError, match="is not in the split train of bus14: choose one such as"):
         vector.reset(options={"scenario": "no such month"})
     assert vector.reset(seed=0)[0].shape[0] == 2, "the workers must still answer"
     vector.close()
