@@ -7,6 +7,7 @@ from pathlib import Path
 
 from rl2grid.agents.agent import Agent
 from rl2grid.agents.do_nothing import DoNothing
+from rl2grid.agents.greedy import Greedy
 from rl2grid.agents.random_agent import RandomAgent
 from rl2grid.agents.recovery import Recovery
 from rl2grid.errors import one_of
@@ -15,6 +16,7 @@ AGENTS: dict[str, Callable[[], Agent]] = {
     DoNothing.name: DoNothing,
     RandomAgent.name: RandomAgent,
     Recovery.name: Recovery,
+    Greedy.name: Greedy,
 }
 """Agents that need no training, by name."""
 
