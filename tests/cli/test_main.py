@@ -58,8 +58,9 @@ def test_tasks_of_one_grid(capsys):
         (["evaluate", "do-nothing", "bus14-T0", "--split", "dev"], "choose from 'train', 'validation'"),
         (["evaluate", "do-nothing", "bus14-T0", "--seeds", "0"], "seeds"),
         (["evaluate", "do-nothing", "bus14-T0", "--engine", "fast"], "choose from 'native', 'reference'"),
-        (["rank", "bus15", "--provisional"], "choose one of bus14"),
-        (["rank", "bus14", "--provisional", "--states", "0"], "at least 1"),
+        (["rank", "bus15"], "choose one of bus14"),
+        (["rank", "bus14", "--sampling", "lucky"], "choose one of exhaustive, uniform"),
+        (["rank", "bus14", "--states", "0"], "at least 2"),
     ],
 )
 def test_refusals_are_one_sentence_with_what_is_allowed(capsys, tmp_path, monkeypatch, command_line, part):

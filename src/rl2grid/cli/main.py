@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import NoReturn
 
 from rl2grid import __version__
-from rl2grid.cli import data
+from rl2grid.cli import actions, data
 from rl2grid.cli.train import INTERRUPTED, train
 from rl2grid.engines import ENGINES, HEURISTICS
 from rl2grid.errors import UsageError
-from rl2grid.scenarios.library import SPLITS
+from rl2grid.scenarios.splits import SPLITS
 
 REFUSED = 2
 
@@ -55,6 +55,7 @@ def _run(command_line: list[str]) -> int:
     commands.add_parser("train", help="train an algorithm on a task", add_help=False)
     _add_evaluate(commands)
     _add_rank(commands)
+    actions.add_parser(commands)
     data.add_parser(commands)
     if command_line[:1] == ["train"]:
         return train(command_line[1:])
@@ -95,7 +96,7 @@ def _tasks(options: argparse.Namespace) -> int:
 
 def _add_evaluate(commands: argparse._SubParsersAction[_Parser]) -> None:
     parser = commands.add_parser("evaluate", help="play agents on enumerated scenarios, one row per episode")
-    parser.add_argument("agent", help="do-nothing, random, recovery, or a run folder or checkpoint")
+    parser.add_argument("agent", help="do-nothing, random, recovery, greedy, or a run folder or checkpoint")
     parser.add_argument("task", help="for example bus14-T0")
     parser.add_argument("--split", default="validation", choices=SPLITS, help="validation picks models; test is last")
     parser.add_argument("--seeds", type=int, default=1, help="episodes per scenario, with seeds 0, 1, ...")
@@ -115,12 +116,12 @@ def _evaluate(options: argparse.Namespace) -> int:
 
 
 def _add_rank(commands: argparse._SubParsersAction[_Parser]) -> None:
-    parser = commands.add_parser("rank", help="rank a grid's topology actions by a one-step what-if screen")
+    parser = commands.add_parser("rank", help="rank a grid's topology actions by trying them")
     parser.add_argument("grid", help="for example bus14")
-    parser.add_argument("--provisional", action="store_true", required=True, help="the what-if screen")
-    parser.add_argument("--states", type=int, default=300, help="states in which the actions are tried")
+    parser.add_argument("--states", type=int, default=1000, help="operating points in which the actions are tried")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--pool", type=int, default=2000, help="actions that are tried with the AC power flow")
+    parser.add_argument("--sampling", default="exhaustive", help="exhaustive, or uniform as in the paper")
+    parser.add_argument("--threads", type=int, default=None, help="threads that try; by default one per core")
     parser.add_argument("--output", type=Path, default=Path("rankings"), help="folder of the result")
     parser.set_defaults(run=_rank)
 
@@ -128,6 +129,13 @@ def _add_rank(commands: argparse._SubParsersAction[_Parser]) -> None:
 def _rank(options: argparse.Namespace) -> int:
     from rl2grid.experiments.ranking import run_ranking
 
-    path = run_ranking(options.grid, options.states, options.seed, options.pool, options.output)
+    path = run_ranking(
+        options.grid,
+        options.states,
+        options.seed,
+        options.sampling,
+        options.output,
+        num_threads=options.threads,
+    )
     print(f"Ranking written to {path}.")
     return 0
