@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from made_up_ranking import made_up_arrays, use_ranking
 
 from rl2grid.errors import UsageError
 from rl2grid.grids import GRID_IDS, load_grid
-from rl2grid.grids.rankings import ranking, ranking_hash
+from rl2grid.grids.rankings import ranking, ranking_hash, trials
 
 
 @pytest.mark.parametrize("grid_id", GRID_IDS)
@@ -13,7 +14,7 @@ def test_a_ranking_serves_every_level_below_the_highest(grid_id):
     grid, ranked = load_grid(grid_id), ranking(grid_id)
     assert ranked.ids.dtype == np.int32
     assert len(ranked.ids) >= grid.level_sizes[-2] - 1
-    assert len(ranked.ids) <= 12_000
+    assert len(ranked.ids) < grid.level_sizes[-1]
     assert len(np.unique(ranked.ids)) == len(ranked.ids)
     assert ranked.ids.min() >= 1
     assert ranked.ids.max() < grid.level_sizes[-1]
@@ -22,8 +23,8 @@ def test_a_ranking_serves_every_level_below_the_highest(grid_id):
 @pytest.mark.parametrize("grid_id", GRID_IDS)
 def test_a_ranking_tells_how_it_was_made(grid_id):
     metadata = ranking(grid_id).metadata
-    assert metadata["version"] == "provisional-1"
-    assert metadata["command"].startswith(f"rl2grid rank {grid_id} --provisional ")
+    assert metadata["version"] == "1"
+    assert metadata["command"].startswith(f"rl2grid rank {grid_id} --states ")
     assert metadata["grid"] == grid_id
     assert metadata["split"] == "train"
     assert sum(metadata["states"].values()) >= 200
@@ -42,3 +43,45 @@ def test_a_ranking_can_not_be_changed():
 def test_an_unknown_grid_is_refused():
     with pytest.raises(UsageError, match="'bus15' does not exist: choose one of bus14"):
         ranking("bus15")
+
+
+def test_trials_are_read_as_they_were_written(tmp_path, monkeypatch):
+    arrays = made_up_arrays("bus14")
+    use_ranking(monkeypatch, tmp_path, "bus14", arrays)
+    tried = trials("bus14")
+    assert (tried.trials.dtype, tried.survived.dtype, tried.margin.dtype) == (np.uint32, np.uint32, np.float32)
+    for name in ("trials", "survived", "margin"):
+        assert (getattr(tried, name) == arrays[name]).all()
+        with pytest.raises(ValueError, match="read-only"):
+            getattr(tried, name)[0] = 1
+    assert (ranking("bus14").ids == arrays["ids"]).all()
+
+
+def test_survival_is_the_share_of_trials_and_unknown_without_any(tmp_path, monkeypatch):
+    arrays = made_up_arrays("bus14")
+    arrays["trials"][:3], arrays["survived"][:3] = (0, 4, 5), (0, 1, 5)
+    use_ranking(monkeypatch, tmp_path, "bus14", arrays)
+    survival = trials("bus14").survival
+    assert np.isnan(survival[0])
+    assert survival[1:3].tolist() == [0.25, 1.0]
+    assert not np.isnan(survival[1:]).any()
+
+
+def test_a_ranking_without_trials_serves_levels_but_not_people(tmp_path, monkeypatch):
+    use_ranking(monkeypatch, tmp_path, "bus14", {"ids": np.array([5, 3], np.int32)})
+    assert ranking("bus14").ids.tolist() == [5, 3]
+    with pytest.raises(UsageError, match=r"bus14 does not tell how often .* make it anew with `rl2grid rank bus14`"):
+        trials("bus14")
+
+
+def test_trials_of_another_number_of_actions_are_refused(tmp_path, monkeypatch):
+    arrays = made_up_arrays("bus14")
+    arrays["margin"] = arrays["margin"][:-1]
+    use_ranking(monkeypatch, tmp_path, "bus14", arrays)
+    with pytest.raises(UsageError, match="tells of 208 actions where the grid has 209"):
+        trials("bus14")
+
+
+def test_trials_of_an_unknown_grid_are_refused():
+    with pytest.raises(UsageError, match="'bus15' does not exist: choose one of bus14"):
+        trials("bus15")
