@@ -58,12 +58,12 @@ class FakeGrid(gymnasium.Env[Any, Any]):
         self._scenario, self._start = options["scenario"], options["start"]
         if self._log is not None:
             with Path(self._log).open("a") as file:
-                file.write(f"{self._scenario} {seed}\n")
+                file.write(f"{self._scenario} {seed % 2**31}\n")
         if self._scenario == self._fail_on:
             raise ValueError("the fake grid was told to fail")
         if self._scenario == self._exit_on:
             raise SystemExit(3)
-        self._random = np.random.Generator(np.random.Philox(key=[seed, zlib.crc32(self._scenario.encode())]))
+        self._random = np.random.Generator(np.random.Philox(key=[seed % 2**31, zlib.crc32(self._scenario.encode())]))
         self._stress = 0.6 if "doomed" in self._scenario else 0.0
         self._step = 0
         self._state = SimpleNamespace(

@@ -25,7 +25,7 @@ from rl2grid.analysis.results import EVALUATION_FILE, EvaluationResult, load_eva
 from rl2grid.engines import ENGINES
 from rl2grid.envs.registration import register_all
 from rl2grid.errors import UsageError
-from rl2grid.experiments.episode import play_episode
+from rl2grid.experiments.episode import environment_seed, play_episode
 from rl2grid.experiments.evaluation import PARTIAL_FILE, evaluate, run_evaluation, validator
 from rl2grid.experiments.players import Job, Setting
 from rl2grid.experiments.runs import hyperparameters
@@ -116,6 +116,12 @@ def test_results_do_not_depend_on_workers_or_order(tmp_path):
     backwards = play(jobs=JOBS[::-1])
     assert without_times(backwards.episodes) == without_times(alone.episodes)[::-1]
     assert load_evaluation(tmp_path / "two").summary.survival == alone.summary.survival
+
+
+def test_months_share_no_draws():
+    seeds = {environment_seed(scenario, seed) for scenario in ("a", "b", "c") for seed in range(5)}
+    assert len(seeds) == 15
+    assert max(seeds) < 2**63
 
 
 def test_random_episodes_differ_between_seeds_and_scenarios():

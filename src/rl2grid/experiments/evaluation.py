@@ -71,7 +71,8 @@ def evaluate(
         task_id: id of the task; the namespace and the version may be left out.
         split: whose scenarios are played: ``"validation"``, ``"test"``, ``"train"`` or ``"bundled"``.
         scenarios: play these only; None: all of the split.
-        seeds: of maintenance, opponent and agent.
+        seeds: of maintenance, opponent and agent; each scenario has its own draws with the same seed
+            (:func:`rl2grid.experiments.episode.environment_seed`).
         start: row of each scenario at which its episodes begin.
         heuristic: None, ``"idle"``, ``"recovery"`` or :data:`AS_TRAINED`.
         workers: processes that play at the same time; 0: this process plays; None: this one on the native engine,
