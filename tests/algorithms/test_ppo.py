@@ -11,6 +11,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from constrained_toys import Lever
 from gymnasium.vector import AutoresetMode
 from torch import Tensor
 from toy_grid import ToyGrid
@@ -18,6 +19,7 @@ from toy_grid import ToyGrid
 from rl2grid.algorithms.checkpoint import load_checkpoint, save_checkpoint
 from rl2grid.algorithms.ppo import (
     PPO,
+    SEARCH_SPACE,
     ActorCritic,
     Args,
     Minibatch,
@@ -627,6 +629,9 @@ def test_the_preset_paper_is_the_papers_table(continuous: bool):
     assert args.gamma == 0.9
     assert args.max_grad_norm == 10.0
     assert args.mask_actions is False
+    for name in set(SEARCH_SPACE) - {"num_envs * num_steps"}:
+        assert getattr(args, name) in SEARCH_SPACE[name], name
+    assert args.num_envs * args.num_steps in SEARCH_SPACE["num_envs * num_steps"]
 
 
 def test_presets_can_be_changed_and_unknown_ones_are_refused():
@@ -647,6 +652,7 @@ def test_presets_can_be_changed_and_unknown_ones_are_refused():
         ({"actor_learning_rate": -1.0}, "positive actor_learning_rate"),
         ({"critic_learning_rate": math.nan}, "positive critic_learning_rate"),
         ({"seed": -1}, "seed of at least 0"),
+        ({"device": "gpu"}, "choose one of auto, cpu, cuda"),
         ({"total_timesteps": 63}, "at least num_envs . num_steps = 64, not 63"),
     ],
 )
@@ -756,3 +762,57 @@ def test_untrained_policy_does_nothing_as_often_as_asked():
     assert torch.allclose(probabilities, torch.full((50,), 0.6), atol=0.05)
     with pytest.raises(UsageError, match="initial_do_nothing between 0 and 1"):
         replace(SMALL, initial_do_nothing=1.0)
+
+
+def test_the_best_continuous_action_is_found_and_explored_less_and_less():
+    """It pays minus the squared distance to 0.2 + 0.5 x: a spread policy pays less, so the deviation shrinks."""
+    args = replace(
+        SMALL_CONTINUOUS,
+        total_timesteps=200 * 256,
+        num_envs=16,
+        num_minibatches=1,
+        update_epochs=4,
+        reward_scale=1.0,
+        actor_learning_rate=3e-3,
+        critic_learning_rate=1e-2,
+        entropy_coefficient=0.0,
+        normalize_observations=False,
+        actor_layers=(32,),
+        critic_layers=(32,),
+        initial_log_std=-1.0,
+    )
+    learner = PPO(args, Lever(16))
+    while not learner.finished:
+        learner.iterate()
+    observations = torch.linspace(-1.0, 1.0, 9).unsqueeze(1)
+    with torch.no_grad():
+        actions = learner.network.act(observations, None, None)
+    torch.testing.assert_close(actions, Lever.best(observations), rtol=0, atol=0.08)
+    assert float(learner.network.log_std.detach().exp()) < 0.2
+
+
+# --- Devices --------------------------------------------------------------------------------------------------------
+
+
+def test_auto_takes_cuda_where_there_is_one(monkeypatch: pytest.MonkeyPatch):
+    assert trainer(device="auto").device.type == ("cuda" if torch.cuda.is_available() else "cpu")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert trainer(device="auto").device.type == "cpu"
+    with pytest.raises(UsageError, match="finds no CUDA device"):
+        trainer(device="cuda")
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@BOTH
+def test_a_run_begun_on_cuda_is_reproducible_and_goes_on_on_the_cpu(continuous: bool, tmp_path: Path):
+    first, second = trainer(continuous, device="cuda"), trainer(continuous, device="cuda")
+    for _ in range(3):
+        first.iterate()
+        second.iterate()
+    assert_same(weights(first), weights(second))
+    save_checkpoint(tmp_path / "c.pt", {"task": "t", "training": first.state_dict(), "policy": first.policy_state()})
+    checkpoint = load_checkpoint(tmp_path / "c.pt")
+    resumed = trainer(continuous)
+    resumed.load_state_dict(checkpoint["training"])
+    resumed.iterate()
+    assert load_policy(checkpoint["policy"]).actor[0].weight.device.type == "cpu"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from rl2grid.agents.agent import Action, Info, Observation
-from rl2grid.algorithms import ppo
+from rl2grid.algorithms import dqn, lagrangian_ppo, ppo, sac, td3
 from rl2grid.algorithms.checkpoint import load_checkpoint
 from rl2grid.envs.normalization import ObservationNormalizer
 from rl2grid.envs.tasks import find_task
@@ -24,7 +24,13 @@ BEST_FILE = "best.pt"
 CHECKPOINT_FILE = "checkpoint.pt"
 """In a run folder: everything needed to go on."""
 
-_NETWORKS = {"ppo": ppo.load_policy}
+_NETWORKS: dict[str, Callable[[Mapping[str, Any]], Any]] = {
+    "ppo": ppo.load_policy,
+    "lagrangian-ppo": lagrangian_ppo.load_policy,
+    "dqn": dqn.load_policy,
+    "sac": sac.load_policy,
+    "td3": td3.load_policy,
+}
 
 
 class PolicyAgent:
@@ -35,7 +41,7 @@ class PolicyAgent:
 
         Args:
             contents: See :mod:`rl2grid.algorithms.checkpoint`; ``training`` is not needed.
-            deterministic: Whether to play the most probable action instead of a sample.
+            deterministic: Whether to play the most probable action instead of a sample (DQN and TD3 have no others).
             name: What tables call the agent; by default the name of the algorithm.
         """
         policy = contents["policy"]
@@ -117,7 +123,7 @@ def load_agent(
     Args:
         path: A checkpoint file or a run folder.
         task_id: The task that it is to play; None: the one it was trained on.
-        deterministic: Whether to play the most probable action instead of a sample.
+        deterministic: Whether to play the most probable action instead of a sample (DQN and TD3 have no others).
         name: What tables call the agent; by default the name of the algorithm.
 
     Raises:

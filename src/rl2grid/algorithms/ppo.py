@@ -27,12 +27,18 @@ Randomness
     Initial weights, actions and minibatches come from one generator seeded by ``Args.seed`` and saved
     with the checkpoint; nothing reads a global random state. Environment i is seeded
     ``seed * num_envs + i``: runs of different seeds share no episode.
+
+Devices
+    The networks and a rollout live on ``Args.device``; environments, normalisation and all random draws stay
+    on the CPU, so that a checkpoint made on one device can be resumed on another. Results are the same bit by
+    bit on one kind of device, not across kinds.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
+import os
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -49,6 +55,8 @@ from rl2grid.envs.normalization import NormalizeObservation
 from rl2grid.errors import UsageError, one_of
 
 # --- Hyperparameters ------------------------------------------------------------------------------------------------
+
+DEVICES = ("auto", "cpu", "cuda")
 
 
 @dataclass(frozen=True)
@@ -107,6 +115,8 @@ class Args:
     """Continuous actions only: where the trained log standard deviations start."""
     torch_threads: int = 1
     """Threads of PyTorch; results are reproducible bit by bit for a given number only."""
+    device: str = "cpu"
+    """Where the networks are: ``cpu``, ``cuda``, or ``auto`` (``cuda`` if there is one)."""
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work.
@@ -126,6 +136,8 @@ class Args:
                 raise UsageError(f"PPO needs a positive {name}, not {getattr(self, name)}.")
         if self.initial_do_nothing is not None and not 0.0 < self.initial_do_nothing < 1.0:
             raise UsageError(f"PPO needs initial_do_nothing between 0 and 1, not {self.initial_do_nothing}.")
+        if self.device not in DEVICES:
+            raise one_of("Device", self.device, DEVICES)
         if self.seed < 0:
             raise UsageError(f"PPO needs a seed of at least 0, not {self.seed}.")
         if self.gamma == 1.0 and self.reward_scale is None:
@@ -186,6 +198,20 @@ def paper(*, continuous: bool) -> Args:
 
 
 PRESETS: dict[str, Callable[..., Args]] = {"default": default, "paper": paper}
+
+SEARCH_SPACE: dict[str, tuple[float, ...]] = {
+    "num_envs": (10, 20, 50),
+    "num_envs * num_steps": (10_000, 20_000, 50_000),
+    "gamma": (0.9, 0.95, 0.99),
+    "max_grad_norm": (10.0, 20.0, 50.0),
+    "num_minibatches": (4, 8, 12),
+    "update_epochs": (20, 40, 80),
+    "actor_learning_rate": (3e-3, 3e-4, 3e-5),
+    "critic_learning_rate": (3e-3, 3e-4, 3e-5),
+    "clip_coefficient": (0.1, 0.2, 0.3),
+}
+"""The values among which the paper searched (its table of hyperparameters); it tells transitions per update, not steps.
+The weights of the reward, which it searched as well, belong to the environment."""
 
 
 def preset(name: str, *, continuous: bool, **changes: Any) -> Args:
@@ -251,18 +277,19 @@ class ActorCritic(nn.Module):
         Args:
             observations: Normalised as in training.
             masks: Legal discrete actions, bool [batch, actions]; None: all are.
-            generator: Source of the sample; None: the most probable action.
+            generator: Source of the sample, on the CPU; None: the most probable action.
         """
         output = self.actor(observations)
         if self.continuous:
             mean: Tensor = output
             if generator is None:
                 return mean
-            return mean + self.log_std.exp() * torch.randn(mean.shape, generator=generator)
+            return mean + self.log_std.exp() * torch.randn(mean.shape, generator=generator).to(mean.device)
         log_probabilities = _log_probabilities(output, masks)
         if generator is None:
             return log_probabilities.argmax(dim=-1)
-        return torch.multinomial(log_probabilities.exp(), 1, generator=generator).squeeze(-1)
+        actions = torch.multinomial(log_probabilities.exp().cpu(), 1, generator=generator)
+        return actions.squeeze(-1).to(output.device)
 
     def log_probability_and_entropy(
         self, observations: Tensor, actions: Tensor, masks: Tensor | None
@@ -435,6 +462,7 @@ class PPO:
         torch.set_num_threads(args.torch_threads)
         torch.use_deterministic_algorithms(True)
         self.args = args
+        self.device = _find_device(args.device)
         self.continuous = _check_environments(args, envs)
         self.envs = NormalizeObservation(envs) if args.normalize_observations else envs
         self.generator = torch.Generator().manual_seed(args.seed)
@@ -451,6 +479,7 @@ class PPO:
         )
         if args.initial_do_nothing is not None and not self.continuous:
             self.network.prefer_first_action(args.initial_do_nothing)
+        self.network.to(self.device)
         self._groups = (self.network.actor_parameters(), list(self.network.critic.parameters()))
         self.optimizer = torch.optim.Adam([{"params": parameters} for parameters in self._groups], eps=1e-5)
         self.reward_scale = 1.0 - args.gamma if args.reward_scale is None else args.reward_scale
@@ -488,7 +517,7 @@ class PPO:
         columns = [None if column[0] is None else torch.stack(column) for column in zip(*steps, strict=True)]
         rollout = Rollout(*columns)  # type: ignore[arg-type]
         with torch.no_grad():
-            last_values = self.network.value(torch.tensor(self._observations, dtype=torch.float32))
+            last_values = self.network.value(self._tensor(self._observations, torch.float32))
         following = torch.cat([rollout.values[1:], last_values.unsqueeze(0)])
         rollout = rollout._replace(next_values=torch.where(rollout.ended, rollout.next_values, following))
         return rollout, {**tally.metrics(), "charts/grid_steps": float(self.grid_steps)}
@@ -496,8 +525,8 @@ class PPO:
     def _play(self, tally: _Tally) -> Rollout:
         """One decision in every environment: a slice of a rollout, its ``next_values`` known where episodes ended."""
         args, network = self.args, self.network
-        observations = torch.tensor(self._observations, dtype=torch.float32)
-        masks = torch.tensor(self.envs.action_masks()) if args.mask_actions else None  # type: ignore[attr-defined]
+        observations = self._tensor(self._observations, torch.float32)
+        masks = self._tensor(self.envs.action_masks()) if args.mask_actions else None  # type: ignore[attr-defined]
         with torch.no_grad():
             actions = network.act(observations, masks, self.generator)
             log_probabilities, _ = network.log_probability_and_entropy(observations, actions, masks)
@@ -529,12 +558,12 @@ class PPO:
             masks,
             actions,
             log_probabilities,
-            rewards=torch.tensor(discounted * self.reward_scale, dtype=torch.float32),
-            discounts=torch.tensor(args.gamma**n_steps, dtype=torch.float32),
+            rewards=self._tensor(discounted * self.reward_scale, torch.float32),
+            discounts=self._tensor(args.gamma**n_steps, torch.float32),
             values=values,
             next_values=self._values_at_truncation(infos, truncated & ~terminated),
-            ended=torch.tensor(ended),
-            decided=torch.tensor(decided),
+            ended=self._tensor(ended),
+            decided=self._tensor(decided),
         )
 
     def update(self, rollout: Rollout) -> dict[str, float]:
@@ -556,7 +585,7 @@ class PPO:
         history: list[Losses] = []
         epochs = 0
         for _ in range(args.update_epochs if len(rows) else 0):
-            order = rows[torch.randperm(len(rows), generator=self.generator)]
+            order = rows[torch.randperm(len(rows), generator=self.generator).to(self.device)]
             first = len(history)
             for chosen in order.tensor_split(args.num_minibatches):
                 if len(chosen):
@@ -632,15 +661,20 @@ class PPO:
 
     def _playable(self, actions: Tensor) -> NDArray[Any]:
         """What the environments are given: ids, or the actions clipped into their box."""
+        actions = actions.cpu()
         return actions.clamp(-1.0, 1.0).numpy() if self.continuous else actions.numpy()
+
+    def _tensor(self, array: Any, dtype: torch.dtype | None = None) -> Tensor:
+        """A copy of an array on the networks' device."""
+        return torch.tensor(array, dtype=dtype, device=self.device)
 
     def _values_at_truncation(self, infos: Mapping[str, Any], truncated: NDArray[np.bool_]) -> Tensor:
         """V of the last observations of truncated episodes, 0 elsewhere [num_envs]."""
-        values = torch.zeros(len(truncated))
+        values = torch.zeros(len(truncated), device=self.device)
         if truncated.any():
-            last = np.stack([infos["final_obs"][i] for i in np.flatnonzero(truncated)]).astype(np.float32)
+            last = np.stack([infos["final_obs"][i] for i in np.flatnonzero(truncated)])
             with torch.no_grad():
-                values[torch.as_tensor(truncated)] = self.network.value(torch.as_tensor(last))
+                values[self._tensor(truncated)] = self.network.value(self._tensor(last, torch.float32))
         return values
 
     def _set_learning_rates(self) -> tuple[float, float]:
@@ -711,6 +745,18 @@ def explained_variance(values: Tensor, returns: Tensor) -> float:
     if variance == 0:
         return math.nan
     return float(1.0 - (returns - values).var(correction=0) / variance)
+
+
+def _find_device(name: str) -> torch.device:
+    """The device called ``name``, set up so that it computes the same every time."""
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    if name == "cuda":
+        if not torch.cuda.is_available():
+            raise UsageError("PyTorch finds no CUDA device here: set device to cpu or auto.")
+        # Without it, cuBLAS is refused by use_deterministic_algorithms.
+        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
+    return torch.device(name)
 
 
 def _check_environments(args: Args, envs: VectorEnv[Any, Any, Any]) -> bool:

@@ -15,8 +15,7 @@ from rl2grid.errors import UsageError, one_of
 
 if TYPE_CHECKING:
     from rl2grid.algorithms.policy_agent import PolicyAgent
-    from rl2grid.algorithms.ppo import Args
-    from rl2grid.experiments.runs import RunArgs
+    from rl2grid.experiments.runs import Hyperparameters, RunArgs
 
 INTERRUPTED = 130
 """Exit status after an interrupt, as shells have it."""
@@ -25,9 +24,10 @@ _HELP = """\
 usage: rl2grid train <algorithm> <task> [flags]
        rl2grid train --resume <run folder>
 
-Trains an algorithm (ppo) on a task (see `rl2grid tasks`) and writes a run folder: configuration, metrics.csv,
-tensorboard/, checkpoint.pt, best.pt by validation survival, log.txt. A run that was interrupted goes on with
---resume. Flags and their defaults with --help after the task, for example `rl2grid train ppo bus14-T0 --help`.
+Trains an algorithm (ppo, lagrangian-ppo, dqn, sac, td3) on a task (see `rl2grid tasks`) and writes a run folder:
+configuration, metrics.csv, tensorboard/, checkpoint.pt, best.pt by validation survival, log.txt. A run that was
+interrupted goes on with --resume. Flags and their defaults with --help after the task, for example
+`rl2grid train ppo bus14-T0 --help`.
 """
 
 
@@ -141,7 +141,7 @@ def _preset(flags: list[str]) -> str:
     return "default"
 
 
-def _parse(program: str, flags: list[str], hyperparameters: Args) -> tuple[TrainFlags, Args]:
+def _parse(program: str, flags: list[str], hyperparameters: Hyperparameters) -> tuple[TrainFlags, Hyperparameters]:
     """The flags of the run and of the algorithm, in one list."""
     import tyro
 

@@ -5,6 +5,7 @@ A run folder holds
 - ``config.json``: the request, its identity (versions, hashes) and its seeds;
 - ``metrics.csv`` and ``tensorboard/``: see :mod:`rl2grid.algorithms.metrics`;
 - ``checkpoint.pt``: everything needed to go on, see :mod:`rl2grid.algorithms.checkpoint`;
+- ``replay/``: what DQN, SAC and TD3 remember, until the run is finished, see :mod:`rl2grid.algorithms.replay`;
 - ``best.pt``: the policy with the highest validation survival so far, the latest of equals;
 - ``log.txt``: what happened when.
 
@@ -25,15 +26,16 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import gymnasium
 from filelock import FileLock, Timeout
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from rl2grid.algorithms import ppo
+from rl2grid.algorithms import dqn, lagrangian_ppo, ppo, sac, td3
 from rl2grid.algorithms.checkpoint import load_checkpoint, save_checkpoint
 from rl2grid.algorithms.metrics import MetricsWriter
+from rl2grid.algorithms.off_policy import OffPolicyTrainer
 from rl2grid.algorithms.policy_agent import BEST_FILE, CHECKPOINT_FILE, PolicyAgent
 from rl2grid.envs.registration import register_all
 from rl2grid.envs.tasks import Task, TaskOptions, find_task
@@ -46,27 +48,59 @@ from rl2grid.versions import library_versions
 CONFIG_FILE = "config.json"
 LOG_FILE = "log.txt"
 LOCK_FILE = ".lock"
+REPLAY_FOLDER = "replay"
 
 VectorEnvironment = gymnasium.vector.VectorEnv[Any, Any, Any]
 Evaluate = Callable[[PolicyAgent], Mapping[str, float]]
 """Plays the validation scenarios and returns means over them, ``survival`` among them."""
+Hyperparameters = ppo.Args | lagrangian_ppo.Args | dqn.Args | sac.Args | td3.Args
+
+
+class Trainer(Protocol):
+    """What a run needs of an algorithm in progress."""
+
+    num_iterations: int
+    decisions: int
+    grid_steps: int
+
+    @property
+    def finished(self) -> bool:
+        """Whether the budget of decisions is used up."""
+
+    def iterate(self) -> dict[str, float]:
+        """Play ``num_steps`` decisions in every environment, learn, and return the metrics."""
+
+    def policy_state(self) -> dict[str, Any]:
+        """All that is needed to act."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that is needed to go on, after an iteration."""
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on where ``state_dict`` was called, bit for bit."""
 
 
 @dataclass(frozen=True)
 class Algorithm:
     """What a run needs to know of an algorithm."""
 
-    args: type[ppo.Args]
+    args: type[Hyperparameters]
     """Its hyperparameters."""
-    trainer: type[ppo.PPO]
-    """Made of hyperparameters and environments; has ``iterate``, ``finished``, ``policy_state``, ``state_dict``."""
+    trainer: Callable[[Any, VectorEnvironment], Trainer]
+    """Made of hyperparameters and environments."""
     kinds: tuple[str, ...]
     """Kinds of task that it can learn: ``"T"`` (discrete actions), ``"R"`` (continuous actions)."""
-    preset: Callable[..., ppo.Args]
+    preset: Callable[..., Hyperparameters]
     """``preset(name, continuous=..., **changes)``."""
 
 
-ALGORITHMS: dict[str, Algorithm] = {"ppo": Algorithm(ppo.Args, ppo.PPO, ("T", "R"), ppo.preset)}
+ALGORITHMS: dict[str, Algorithm] = {
+    "ppo": Algorithm(ppo.Args, ppo.PPO, ("T", "R"), ppo.preset),
+    "lagrangian-ppo": Algorithm(lagrangian_ppo.Args, lagrangian_ppo.LagrangianPPO, ("T", "R"), lagrangian_ppo.preset),
+    "dqn": Algorithm(dqn.Args, dqn.DQN, ("T",), dqn.preset),
+    "sac": Algorithm(sac.Args, sac.SAC, ("T", "R"), sac.preset),
+    "td3": Algorithm(td3.Args, td3.TD3, ("R",), td3.preset),
+}
 
 
 @dataclass(frozen=True)
@@ -75,7 +109,7 @@ class RunArgs:
 
     task: str
     """Task id, such as ``rl2grid/bus14-T0-v0``; the namespace and the version may be left out."""
-    hyperparameters: ppo.Args
+    hyperparameters: Hyperparameters
     """Of the algorithm, the seed and the budget among them; see :func:`hyperparameters`."""
     algorithm: str = "ppo"
     """Name of the algorithm."""
@@ -97,7 +131,7 @@ class RunArgs:
     """Whether to show a progress bar."""
 
 
-def hyperparameters(algorithm: str, task: str, preset: str = "default", **changes: Any) -> ppo.Args:
+def hyperparameters(algorithm: str, task: str, preset: str = "default", **changes: Any) -> Hyperparameters:
     """A preset of an algorithm for a task, some values changed.
 
     Raises:
@@ -229,7 +263,7 @@ class _Run:
         folder: Path,
         args: RunArgs,
         identity: Mapping[str, Any],
-        trainer: ppo.PPO,
+        trainer: Trainer,
         evaluate: Evaluate | None,
     ) -> None:
         self.folder = folder
@@ -291,9 +325,11 @@ class _Run:
 def _run(run: _Run, checkpoint: Mapping[str, Any] | None) -> None:
     """Train until the budget is used up or a signal asks to stop."""
     args, trainer = run.args, run.trainer
+    if isinstance(trainer, OffPolicyTrainer):
+        trainer.store_in(run.folder / REPLAY_FOLDER)
     if checkpoint is not None:
         run.load(checkpoint)
-    run.note(f"{'resumed' if checkpoint else 'started'} at {trainer.decisions} of {_budget(trainer)} decisions")
+    run.note(f"{'resumed' if checkpoint else 'started'} at {trainer.decisions} of {_budget(args, trainer)} decisions")
     after_step = trainer.decisions if checkpoint is not None else -1
     metrics = MetricsWriter(run.folder, after_step=after_step, tensorboard=args.tensorboard)
     saved_at, saved_decisions = time.monotonic(), trainer.decisions
@@ -317,14 +353,16 @@ def _run(run: _Run, checkpoint: Mapping[str, Any] | None) -> None:
                     saved_at, saved_decisions = time.monotonic(), trainer.decisions
             if trainer.decisions != saved_decisions:
                 run.save()
+            if trainer.finished:
+                shutil.rmtree(run.folder / REPLAY_FOLDER, ignore_errors=True)
     finally:
         metrics.close()
     run.note(f"{'finished' if trainer.finished else 'stopped'} at {trainer.decisions} decisions")
 
 
-def _budget(trainer: ppo.PPO) -> int:
+def _budget(args: RunArgs, trainer: Trainer) -> int:
     """Decisions of the whole run: the largest number of full iterations within the request."""
-    return trainer.num_iterations * trainer.args.num_envs * trainer.args.num_steps
+    return trainer.num_iterations * args.hyperparameters.num_envs * args.hyperparameters.num_steps
 
 
 @contextmanager
@@ -353,7 +391,7 @@ def _stop_requests() -> Iterator[threading.Event]:
 
 
 @contextmanager
-def _progress_bar(args: RunArgs, trainer: ppo.PPO) -> Iterator[Callable[[float | None, float | None], None]]:
+def _progress_bar(args: RunArgs, trainer: Trainer) -> Iterator[Callable[[float | None, float | None], None]]:
     """A bar with rate, ETA and survival; yields what to call after every iteration."""
     columns = (
         TextColumn("{task.description}"),
@@ -365,7 +403,7 @@ def _progress_bar(args: RunArgs, trainer: ppo.PPO) -> Iterator[Callable[[float |
     with Progress(*columns, disable=not args.progress) as progress:
         bar = progress.add_task(
             f"{args.algorithm} on {args.task}",
-            total=_budget(trainer),
+            total=_budget(args, trainer),
             completed=trainer.decisions,
             rate="-",
             survival="-",

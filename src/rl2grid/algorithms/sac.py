@@ -1,0 +1,497 @@
+"""Soft actor-critic (Haarnoja et al., 2018; Christodoulou, 2019) for topology and redispatching tasks, in one file.
+
+What is played, remembered and when there is an update is in :mod:`rl2grid.algorithms.off_policy`.
+
+Soft values
+    The policy pi earns its entropy on top of the rewards, once per decision, at the price alpha (the
+    temperature). With slow copies of two critics, transitions are worth
+
+        y = R_k + gamma^{n_k} V(s_{k+1})                            y = R_k after a game over
+        V(s) = E over a ~ pi of [ min over i of Q_i,slow(s, a) - alpha log pi(a | s) ]
+
+    Both critics are fitted to y by squared errors, the policy minimises E over a ~ pi of
+    [alpha log pi(a | s_k) - min over i of Q_i(s_k, a)], and the slow copies move by the share tau of the way.
+
+Discrete actions
+    Critics have one output per action; both expectations are sums over the legal actions, without sampling.
+    Illegal actions have probability zero.
+
+Continuous actions
+    a = tanh(u), u ~ N(mean(s), deviation(s)^2), both expectations by one reparametrised sample. Its density is
+
+        log pi(a | s) = sum over dimensions of [log N(u) - log(1 - tanh(u)^2)]
+        log(1 - tanh(u)^2) = 2 (log 2 - u - softplus(-2 u))         exact also where 1 - tanh(u)^2 rounds to 0
+
+Temperature
+    alpha is fixed, or follows the entropy H(s) of the policy: it minimises alpha (H(s) - target), so that it
+    rises while the entropy is below its target and falls while it is above. The target of discrete actions is
+    a share of the largest entropy possible in the state, log(number of legal actions), and the share falls
+    linearly over the run from ``first_entropy_share`` to ``last_entropy_share``: a policy that must act at random
+    half of the time plays badly on a grid. The target of continuous actions is ``entropy_per_dimension`` for each.
+
+The deterministic action is the most probable one, or tanh(mean).
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, NamedTuple
+
+import torch
+from gymnasium.vector import VectorEnv
+from torch import Tensor, nn
+
+from rl2grid.algorithms.off_policy import (
+    ILLEGAL,
+    Batch,
+    OffPolicyArgs,
+    OffPolicyTrainer,
+    TwinCritics,
+    adam,
+    follow,
+    make_network,
+    random_legal_actions,
+)
+from rl2grid.errors import one_of
+
+# --- Hyperparameters ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Args(OffPolicyArgs):
+    """Hyperparameters; the presets below change some of the values here."""
+
+    algorithm: ClassVar[str] = "SAC"
+
+    actor_learning_rate: float = 3e-4
+    """Adam's step size for the policy."""
+    critic_learning_rate: float = 1e-3
+    """Adam's step size for the critics."""
+    temperature_learning_rate: float = 1e-3
+    """Adam's step size for the logarithm of the temperature."""
+    tau: float = 0.005
+    """Share of the way that the slow critics move."""
+    policy_frequency: int = 1
+    """Updates of the critics per update of the policy and of the temperature."""
+    initial_temperature: float = 0.1
+    """Price of entropy at the beginning."""
+    tune_temperature: bool = True
+    """Whether the temperature follows the entropy's target; else it stays what it is."""
+    first_entropy_share: float = 0.5
+    """Discrete actions only: target entropy at the beginning, as a share of log(number of legal actions)."""
+    last_entropy_share: float = 0.05
+    """Discrete actions only: that share at the end; it changes linearly with the decisions."""
+    entropy_per_dimension: float = -1.0
+    """Continuous actions only: target entropy, per dimension; that of a uniform action is log 2 = 0.69."""
+    random_start: bool = True
+    """Whether actions before ``learning_starts`` are uniform instead of the untrained policy's."""
+    initial_do_nothing: float | None = None
+    """Discrete actions only: probability of action 0 before training; None: all actions are about alike."""
+    actor_layers: tuple[int, ...] = (128, 128)
+    """Widths of the policy's hidden layers (ReLU)."""
+    critic_layers: tuple[int, ...] = (128, 128)
+    """Widths of each critic's hidden layers (ReLU)."""
+
+    def __post_init__(self) -> None:
+        """Refuse values that cannot work; see :class:`OffPolicyArgs`."""
+        super().__post_init__()
+        self._check_counts("policy_frequency")
+        self._check_positive("actor_learning_rate", "critic_learning_rate", "temperature_learning_rate")
+        self._check_positive("tau", "initial_temperature")
+        self._check_shares("tau", "first_entropy_share", "last_entropy_share")
+        if self.initial_do_nothing is not None:
+            self._check_positive("initial_do_nothing")
+            self._check_shares("initial_do_nothing")
+
+
+def default(*, continuous: bool) -> Args:
+    """Our own values, for tasks with a heuristic on a small machine.
+
+    On topology tasks the untrained policy mostly does nothing and plays from the beginning: at random, one of the
+    first few actions would already cut the grid apart, and little would be seen of what comes later.
+    """
+    if continuous:
+        return Args(gamma=0.99, mask_actions=False)
+    return Args(random_start=False, initial_do_nothing=0.6)
+
+
+def paper(*, continuous: bool) -> Args:
+    """The paper's values (its table of hyperparameters, redispatching where ``continuous``).
+
+    The entropy regularisation of the table is a fixed temperature. Where it is silent: 80 million decisions as for
+    PPO, and TD3's tau.
+    """
+    learning_rate = 3e-5 if continuous else 3e-4
+    return Args(
+        total_timesteps=80_000_000,
+        num_envs=50,
+        learning_starts=20_000,
+        train_frequency=50,
+        batch_size=128,
+        buffer_size=500_000,
+        buffer_bytes=16 * 1024**3,
+        gamma=0.9,
+        reward_scale=1.0,
+        max_grad_norm=10.0,
+        mask_actions=False,
+        actor_learning_rate=learning_rate,
+        critic_learning_rate=learning_rate,
+        tau=0.005,
+        policy_frequency=2,
+        initial_temperature=0.2,
+        tune_temperature=False,
+    )
+
+
+PRESETS: dict[str, Callable[..., Args]] = {"default": default, "paper": paper}
+
+SEARCH_SPACE: dict[str, tuple[Any, ...]] = {
+    "num_envs": (10, 20, 50),
+    "max_grad_norm": (10.0, 20.0, 50.0),
+    "gamma": (0.9, 0.95, 0.99),
+    "train_frequency": (50, 100, 1000),
+    "policy_frequency": (2, 4),
+    "buffer_size": (100_000, 250_000, 500_000, 1_000_000),
+    "batch_size": (64, 128, 256),
+    "actor_learning_rate": (3e-3, 3e-4, 3e-5),
+    "critic_learning_rate": (3e-3, 3e-4),
+    "initial_temperature": (0.02, 0.2, 0.4),
+}
+"""The paper's grid search, by hyperparameter (it prints 0.0003 twice among the critic's learning rates)."""
+
+
+def preset(name: str, *, continuous: bool, **changes: Any) -> Args:
+    """A preset for tasks with continuous or discrete actions, some values changed.
+
+    Raises:
+        UsageError: no such preset, or values that cannot work.
+    """
+    if name not in PRESETS:
+        raise one_of("SAC's preset", name, tuple(PRESETS))
+    return replace(PRESETS[name](continuous=continuous), **changes)
+
+
+# --- Networks -------------------------------------------------------------------------------------------------------
+
+_LOG_STD_RANGE = (-5.0, 2.0)
+
+
+class GaussianActor(nn.Module):
+    """A squashed Gaussian: tanh(u), u ~ N(mean(s), deviation(s)^2)."""
+
+    continuous = True
+
+    def __init__(
+        self,
+        observation_size: int,
+        action_size: int,
+        layers: Sequence[int],
+        generator: torch.Generator | None = None,
+    ) -> None:
+        super().__init__()
+        self.observation_size = observation_size
+        self.action_size = action_size
+        self.network = make_network(observation_size, layers, 2 * action_size, generator)
+
+    def forward(self, observations: Tensor) -> tuple[Tensor, Tensor]:
+        """Means and log deviations of u, each [batch, dimensions], the latter within fixed bounds."""
+        means, outputs = self.network(observations).chunk(2, dim=-1)
+        low, high = _LOG_STD_RANGE
+        return means, low + 0.5 * (high - low) * (outputs.tanh() + 1.0)
+
+    def sample(self, observations: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """Actions [batch, dimensions] in [-1, 1] and their log-densities [batch], from standard normal noise."""
+        means, log_stds = self(observations)
+        unsquashed = means + log_stds.exp() * noise
+        return unsquashed.tanh(), squashed_log_densities(unsquashed, means, log_stds)
+
+    def act(self, observations: Tensor, masks: Tensor | None, generator: torch.Generator | None) -> Tensor:
+        """Actions for observations [batch, size], float32 [batch, dimensions]; tanh(mean) without a generator."""
+        unsquashed, log_stds = self(observations)
+        if generator is not None:
+            noise = torch.randn(unsquashed.shape, generator=generator).to(unsquashed.device)
+            unsquashed = unsquashed + log_stds.exp() * noise
+        actions: Tensor = unsquashed.tanh()
+        return actions
+
+
+def squashed_log_densities(unsquashed: Tensor, means: Tensor, log_stds: Tensor) -> Tensor:
+    """Log-densities [batch] of tanh(u), where u ~ N(mean, deviation^2); all arguments [batch, dimensions]."""
+    deviations = (unsquashed - means) / log_stds.exp()
+    normal = -0.5 * deviations.square() - log_stds - 0.5 * math.log(2.0 * math.pi)
+    log_slopes = 2.0 * (math.log(2.0) - unsquashed - nn.functional.softplus(-2.0 * unsquashed))
+    return (normal - log_slopes).sum(dim=-1)
+
+
+class CategoricalActor(nn.Module):
+    """Probabilities of discrete actions."""
+
+    continuous = False
+
+    def __init__(
+        self,
+        observation_size: int,
+        action_size: int,
+        layers: Sequence[int],
+        generator: torch.Generator | None = None,
+    ) -> None:
+        super().__init__()
+        self.observation_size = observation_size
+        self.action_size = action_size
+        self.network = make_network(observation_size, layers, action_size, generator)
+
+    def prefer_first_action(self, probability: float) -> None:
+        """Shift the last layer so that action 0 has about this probability in every state."""
+        last = self.network[-1]
+        assert isinstance(last, nn.Linear)
+        with torch.no_grad():
+            last.bias[0] = math.log(probability / (1.0 - probability) * (self.action_size - 1))
+
+    def forward(self, observations: Tensor, masks: Tensor | None) -> Tensor:
+        """Log-probabilities [batch, actions], of illegal actions large and negative."""
+        logits = self.network(observations)
+        if masks is not None:
+            logits = logits.masked_fill(~masks, ILLEGAL)
+        log_probabilities: Tensor = logits.log_softmax(dim=-1)
+        return log_probabilities
+
+    def act(self, observations: Tensor, masks: Tensor | None, generator: torch.Generator | None) -> Tensor:
+        """Actions for observations [batch, size], int64 [batch]; the most probable ones without a generator."""
+        log_probabilities = self(observations, masks)
+        if generator is None:
+            best: Tensor = log_probabilities.argmax(dim=-1)
+            return best
+        # Drawn on the processor, where the generator is.
+        probabilities = log_probabilities.exp().cpu()
+        return torch.multinomial(probabilities, 1, generator=generator).squeeze(-1)
+
+
+class TwinActionCritics(nn.Module):
+    """Two values of every discrete action, learned independently."""
+
+    def __init__(
+        self,
+        observation_size: int,
+        action_size: int,
+        layers: Sequence[int],
+        generator: torch.Generator | None = None,
+    ) -> None:
+        super().__init__()
+        self.networks = nn.ModuleList(make_network(observation_size, layers, action_size, generator) for _ in range(2))
+
+    def forward(self, observations: Tensor) -> Tensor:
+        """Both values of observations [batch, size] -> [2, batch, actions]."""
+        return torch.stack([network(observations) for network in self.networks])
+
+
+def load_policy(state: Mapping[str, Any]) -> GaussianActor | CategoricalActor:
+    """The network of a checkpoint's section ``policy``."""
+    make = GaussianActor if state["continuous"] else CategoricalActor
+    actor = make(state["observation_size"], state["action_size"], state["actor_layers"])
+    actor.load_state_dict(state["network"])
+    return actor
+
+
+# --- What is optimised ----------------------------------------------------------------------------------------------
+
+
+class PolicyLoss(NamedTuple):
+    """What the policy minimises, and how random it is."""
+
+    loss: Tensor
+    entropies: Tensor
+    """H(s_k) [batch]; of continuous actions estimated by the negative log-density of one sample"""
+
+
+class ContinuousObjective:
+    """Soft values and losses of squashed Gaussian policies."""
+
+    def __init__(self, actor: GaussianActor, critics: TwinCritics, slow: TwinCritics) -> None:
+        self.actor, self.critics, self.slow = actor, critics, slow
+
+    def next_values(self, batch: Batch, alpha: Tensor, noise: Tensor) -> Tensor:
+        """V(s_{k+1}) [batch]."""
+        actions, log_densities = self.actor.sample(batch.next_observations, noise)
+        values: Tensor = self.slow(batch.next_observations, actions).amin(dim=0)
+        return values - alpha * log_densities
+
+    def values(self, batch: Batch) -> Tensor:
+        """Both critics' Q(s_k, a_k) [2, batch]."""
+        values: Tensor = self.critics(batch.observations, batch.actions)
+        return values
+
+    def policy_loss(self, batch: Batch, alpha: Tensor, noise: Tensor) -> PolicyLoss:
+        """The policy's loss at s_k."""
+        actions, log_densities = self.actor.sample(batch.observations, noise)
+        values = self.critics(batch.observations, actions).amin(dim=0)
+        return PolicyLoss((alpha * log_densities - values).mean(), -log_densities.detach())
+
+
+class DiscreteObjective:
+    """Soft values and losses of categorical policies: exact expectations over the legal actions."""
+
+    def __init__(self, actor: CategoricalActor, critics: TwinActionCritics, slow: TwinActionCritics) -> None:
+        self.actor, self.critics, self.slow = actor, critics, slow
+
+    def next_values(self, batch: Batch, alpha: Tensor, noise: Tensor) -> Tensor:
+        """V(s_{k+1}) [batch]; ``noise`` is not needed."""
+        log_probabilities = self.actor(batch.next_observations, batch.next_masks)
+        values = self.slow(batch.next_observations).amin(dim=0)
+        return _expectation(log_probabilities, values - alpha * log_probabilities)
+
+    def values(self, batch: Batch) -> Tensor:
+        """Both critics' Q(s_k, a_k) [2, batch]."""
+        chosen = batch.actions.unsqueeze(-1).expand(2, -1, 1)
+        values: Tensor = self.critics(batch.observations).gather(-1, chosen)
+        return values.squeeze(-1)
+
+    def policy_loss(self, batch: Batch, alpha: Tensor, noise: Tensor) -> PolicyLoss:
+        """The policy's loss at s_k; ``noise`` is not needed."""
+        log_probabilities = self.actor(batch.observations, batch.masks)
+        with torch.no_grad():
+            values = self.critics(batch.observations).amin(dim=0)
+        loss = _expectation(log_probabilities, alpha * log_probabilities - values).mean()
+        return PolicyLoss(loss, -_expectation(log_probabilities, log_probabilities).detach())
+
+
+def _expectation(log_probabilities: Tensor, of: Tensor) -> Tensor:
+    """Sum over actions of probability times value [batch], of [batch, actions]."""
+    return (log_probabilities.exp() * of).sum(dim=-1)
+
+
+def critic_loss(values: Tensor, aims: Tensor) -> Tensor:
+    """Mean squared error of each critic's values [2, batch], summed over both."""
+    return (values - aims).square().mean(dim=1).sum()
+
+
+def temperature_loss(log_alpha: Tensor, entropies: Tensor, target_entropies: Tensor) -> Tensor:
+    """The mean of alpha (H(s) - target): it falls as alpha rises where the entropy is too low."""
+    return (log_alpha.exp() * (entropies - target_entropies).detach()).mean()
+
+
+# --- Training -------------------------------------------------------------------------------------------------------
+
+
+class Temperature(nn.Module):
+    """The logarithm of alpha, trained or not."""
+
+    def __init__(self, initial: float) -> None:
+        super().__init__()
+        self.logarithm = nn.Parameter(torch.tensor(math.log(initial)))
+
+    @property
+    def alpha(self) -> Tensor:
+        """The temperature, a constant to whom it is given."""
+        return self.logarithm.detach().exp()
+
+
+class SAC(OffPolicyTrainer):
+    """One training run; see :class:`OffPolicyTrainer`."""
+
+    args: Args
+
+    def __init__(self, args: Args, envs: VectorEnv[Any, Any, Any]) -> None:
+        """Set up the networks and their optimisers.
+
+        Raises:
+            UsageError: the environments cannot be learned with these hyperparameters.
+        """
+        super().__init__(args, envs)
+        self.objective = self._continuous() if self.continuous else self._discrete()
+        self.actor, self.critics, self.slow = self.objective.actor, self.objective.critics, self.objective.slow
+        self.temperature = Temperature(args.initial_temperature).to(self.device)
+        self.actor_optimizer = adam(self.actor, args.actor_learning_rate)
+        self.critic_optimizer = adam(self.critics, args.critic_learning_rate)
+        self.temperature_optimizer = adam(self.temperature, args.temperature_learning_rate)
+
+    def _continuous(self) -> ContinuousObjective:
+        sizes = (self.observation_size, self.action_size)
+        actor = GaussianActor(*sizes, self.args.actor_layers, self.generator).to(self.device)
+        critics = TwinCritics(*sizes, self.args.critic_layers, self.generator).to(self.device)
+        return ContinuousObjective(actor, critics, copy.deepcopy(critics))
+
+    def _discrete(self) -> DiscreteObjective:
+        sizes = (self.observation_size, self.action_size)
+        actor = CategoricalActor(*sizes, self.args.actor_layers, self.generator).to(self.device)
+        if self.args.initial_do_nothing is not None:
+            actor.prefer_first_action(self.args.initial_do_nothing)
+        critics = TwinActionCritics(*sizes, self.args.critic_layers, self.generator).to(self.device)
+        return DiscreteObjective(actor, critics, copy.deepcopy(critics))
+
+    @property
+    def entropy_share(self) -> float:
+        """Discrete actions: target entropy at this moment, as a share of the largest possible one."""
+        args = self.args
+        progress = min(1.0, self.decisions / args.total_timesteps)
+        return args.first_entropy_share + progress * (args.last_entropy_share - args.first_entropy_share)
+
+    def target_entropies(self, batch: Batch) -> Tensor:
+        """Target entropy in every state of the batch [batch]."""
+        count = len(batch.observations)
+        if self.continuous:
+            return torch.full((count,), self.args.entropy_per_dimension * self.action_size, device=self.device)
+        if batch.masks is None:
+            return torch.full((count,), self.entropy_share * math.log(self.action_size), device=self.device)
+        return self.entropy_share * batch.masks.sum(dim=-1).to(torch.float32).log()
+
+    def explore(self, observations: Tensor, masks: Tensor | None) -> Tensor:
+        """Samples of the policy; uniform actions before it learns, if asked for."""
+        count = len(observations)
+        if self.is_starting and self.args.random_start:
+            if self.continuous:
+                return torch.rand(count, self.action_size, generator=self.generator) * 2.0 - 1.0
+            return random_legal_actions(count, self.action_size, masks, self.generator)
+        return self.actor.act(observations, None if masks is None else masks.to(self.device), self.generator)
+
+    def learn(self, batch: Batch) -> dict[str, Tensor]:
+        """Improve the critics; when due, the policy and the temperature; let the slow critics follow."""
+        args, alpha = self.args, self.temperature.alpha
+        with torch.no_grad():
+            aims = batch.rewards + batch.discounts * self.objective.next_values(batch, alpha, self._noise(batch))
+        values = self.objective.values(batch)
+        error = critic_loss(values, aims)
+        self._descend(self.critic_optimizer, error, self.critics)
+        metrics = {"losses/qf_loss": error, "losses/qf_values": values.mean(), "losses/alpha": alpha}
+        if self.updates % args.policy_frequency == 0:
+            metrics |= self._improve_policy(batch, alpha)
+        follow(self.slow, self.critics, args.tau)
+        return metrics
+
+    def _improve_policy(self, batch: Batch, alpha: Tensor) -> dict[str, Tensor]:
+        policy = self.objective.policy_loss(batch, alpha, self._noise(batch))
+        self._descend(self.actor_optimizer, policy.loss, self.actor)
+        metrics = {"losses/actor_loss": policy.loss, "losses/entropy": policy.entropies.mean()}
+        if not self.args.tune_temperature:
+            return metrics
+        aims = self.target_entropies(batch)
+        loss = temperature_loss(self.temperature.logarithm, policy.entropies, aims)
+        self._descend(self.temperature_optimizer, loss, self.temperature)
+        return {**metrics, "losses/alpha_loss": loss, "losses/target_entropy": aims.mean()}
+
+    def _noise(self, batch: Batch) -> Tensor:
+        """Standard normal numbers [batch, dimensions]; none for discrete actions."""
+        shape = (len(batch.observations), self.action_size if self.continuous else 0)
+        return torch.randn(shape, generator=self.generator).to(self.device)
+
+    def schedule(self) -> dict[str, float]:
+        """The share of the largest entropy that is aimed at."""
+        return {} if self.continuous else {"charts/entropy_share": self.entropy_share}
+
+    def learned(self) -> Mapping[str, nn.Module | torch.optim.Optimizer]:
+        """See :class:`OffPolicyTrainer`."""
+        return {
+            "actor": self.actor,
+            "critics": self.critics,
+            "slow": self.slow,
+            "temperature": self.temperature,
+            "actor_optimizer": self.actor_optimizer,
+            "critic_optimizer": self.critic_optimizer,
+            "temperature_optimizer": self.temperature_optimizer,
+        }
+
+    def policy(self) -> tuple[nn.Module, dict[str, Any]]:
+        """See :class:`OffPolicyTrainer`."""
+        return self.actor, {"actor_layers": list(self.args.actor_layers)}
