@@ -96,7 +96,9 @@ def _tasks(options: argparse.Namespace) -> int:
 
 def _add_evaluate(commands: argparse._SubParsersAction[_Parser]) -> None:
     parser = commands.add_parser("evaluate", help="play agents on enumerated scenarios, one row per episode")
-    parser.add_argument("agent", help="do-nothing, random, recovery, greedy, or a run folder or checkpoint")
+    parser.add_argument(
+        "agent", help="do-nothing, random, recovery, greedy, milp, dc-opf, or a run folder or checkpoint"
+    )
     parser.add_argument("task", help="for example bus14-T0")
     parser.add_argument("--split", default="validation", choices=SPLITS, help="validation picks models; test is last")
     parser.add_argument("--seeds", type=int, default=1, help="episodes per scenario, with seeds 0, 1, ...")

@@ -6,8 +6,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 from rl2grid.agents.agent import Agent
+from rl2grid.agents.dc_opf import DcOpf
 from rl2grid.agents.do_nothing import DoNothing
 from rl2grid.agents.greedy import Greedy
+from rl2grid.agents.milp import Milp
 from rl2grid.agents.random_agent import RandomAgent
 from rl2grid.agents.recovery import Recovery
 from rl2grid.errors import one_of
@@ -17,6 +19,8 @@ AGENTS: dict[str, Callable[[], Agent]] = {
     RandomAgent.name: RandomAgent,
     Recovery.name: Recovery,
     Greedy.name: Greedy,
+    Milp.name: Milp,
+    DcOpf.name: DcOpf,
 }
 """Agents that need no training, by name."""
 

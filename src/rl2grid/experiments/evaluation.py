@@ -66,8 +66,8 @@ def evaluate(
     """Play every scenario with every seed.
 
     Args:
-        agent: ``"do-nothing"``, ``"random"``, ``"recovery"``, the path of a checkpoint or run folder, or an
-            agent that is not bound to an environment yet.
+        agent: ``"do-nothing"``, ``"random"``, ``"recovery"``, ``"greedy"``, ``"milp"``, ``"dc-opf"``, the path of a
+            checkpoint or run folder, or an agent that is not bound to an environment yet.
         task_id: id of the task; the namespace and the version may be left out.
         split: whose scenarios are played: ``"validation"``, ``"test"``, ``"train"`` or ``"bundled"``.
         scenarios: play these only; None: all of the split.

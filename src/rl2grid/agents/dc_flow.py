@@ -1,0 +1,102 @@
+"""The DC approximation of an observed operating point: what planners with linear programmes start from.
+
+Powers in MW, angles in radians. A bus is numbered as in :class:`rl2grid.powerflow.model.Network`: ``sub`` is the
+busbar 1 of a substation, ``sub + n_sub`` its busbar 2. A line's flow is ``susceptance * (angle of the origin - angle
+of the extremity)``, positive from origin to extremity.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
+
+from rl2grid.grids import Grid
+from rl2grid.mdp.state import GridState
+from rl2grid.powerflow.model import Network
+
+F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
+_LEAST_SHARE = 0.5
+"""Share of a line's apparent-power limit that active power may always use, however much reactive power flows."""
+_LEAST_LOADING = 0.05
+"""Loadings below say nothing about the limit in MW."""
+
+
+class DcPoint(NamedTuple):
+    """An operating point as the DC flow sees it; shapes in brackets."""
+
+    busbar: I32  # [topo] 1 or 2, -1 when off
+    injection: F64  # [topo] MW into the grid: productions, minus loads and storage; 0 at line ends
+    flow: F64  # [line] MW, as observed (AC) at the origin
+    limit: F64  # [line] MW
+    susceptance: F64  # [line] MW per radian
+
+
+def dc_point(state: GridState, i: int, grid: Grid, network: Network) -> DcPoint:
+    """The operating point of row ``i`` as last observed.
+
+    The generator that balances the flow makes up for the losses, so that injections sum to zero. The thermal limit in
+    A becomes MW at nominal voltage: of the apparent power at the limit, what the reactive power observed now leaves,
+    ``sqrt(S_limit**2 - Q**2)``, but at least half of it, and at least the ``|P| / rho`` of now (voltages above nominal
+    carry more).
+    """
+    injection = np.zeros(grid.dim_topo)
+    injection[grid.gen_pos_topo_vect] = state.gen_p[i]
+    injection[grid.load_pos_topo_vect] = -state.load_p[i]
+    injection[grid.storage_pos_topo_vect] = -state.storage_power[i]
+    injection[grid.gen_pos_topo_vect[grid.slack_gen]] -= injection.sum()
+    flow = state.p_or[i].astype(np.float64)
+    per_ampere = np.sqrt(3.0) * network.nominal_voltage[network.line_or_sub] / 1000.0
+    apparent, most = per_ampere * state.a_or[i], per_ampere * state.thermal_limit
+    reactive_squared = np.maximum(apparent**2 - flow**2, 0.0)
+    limit = np.sqrt(np.maximum(most**2 - reactive_squared, (_LEAST_SHARE * most) ** 2))
+    limit = np.maximum(limit, np.abs(flow) / np.maximum(state.rho[i], _LEAST_LOADING))
+    susceptance = network.line_susceptance * network.base_power[0]
+    return DcPoint(state.topo_vect[i].copy(), injection, flow, limit, susceptance)
+
+
+def buses(grid: Grid, busbar: I32) -> I32:
+    """The bus of each element, int32 [topo]; -1 for one that is off."""
+    return np.where(busbar > 0, grid.element_to_subid + grid.n_sub * (busbar - 1), -1).astype(np.int32)
+
+
+def is_connected(grid: Grid, busbar: I32) -> bool:
+    """Whether closed lines join all busbars that have an element."""
+    bus = buses(grid, busbar)
+    origin, extremity = bus[grid.line_or_pos_topo_vect], bus[grid.line_ex_pos_topo_vect]
+    closed = (origin >= 0) & (extremity >= 0)
+    links = np.zeros((2 * grid.n_sub, 2 * grid.n_sub), np.bool_)
+    links[origin[closed], extremity[closed]] = True
+    _, part = connected_components(links, directed=False)
+    return len(np.unique(part[bus[bus >= 0]])) == 1
+
+
+def sensitivities(grid: Grid, point: DcPoint) -> F64:
+    """MW more on each line per MW more into each bus, float64 [line, bus], taken out where the flow is balanced.
+
+    Open lines and buses without element have zeros. The grid must be connected.
+    """
+    bus = buses(grid, point.busbar)
+    origin, extremity = bus[grid.line_or_pos_topo_vect], bus[grid.line_ex_pos_topo_vect]
+    closed = np.flatnonzero((origin >= 0) & (extremity >= 0))
+    n_bus = 2 * grid.n_sub
+    slope = np.zeros((grid.n_line, n_bus))  # flow per angle
+    slope[closed, origin[closed]] += point.susceptance[closed]
+    slope[closed, extremity[closed]] -= point.susceptance[closed]
+    incidence = np.sign(slope)
+    slack = bus[grid.gen_pos_topo_vect[grid.slack_gen]]
+    used = np.setdiff1d(np.unique(bus[bus >= 0]), [slack])
+    result = np.zeros((grid.n_line, n_bus))
+    result[:, used] = np.linalg.solve((incidence.T @ slope)[np.ix_(used, used)], slope[:, used].T).T
+    return result
+
+
+def dc_flow(grid: Grid, point: DcPoint) -> F64:
+    """MW on each line, float64 [line]; 0 on open ones. The grid must be connected."""
+    bus, on = buses(grid, point.busbar), point.busbar > 0
+    into = np.bincount(bus[on], point.injection[on], 2 * grid.n_sub)
+    flow: F64 = sensitivities(grid, point) @ into
+    return flow
