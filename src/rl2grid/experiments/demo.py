@@ -27,8 +27,8 @@ from rl2grid.scenarios.library import list_scenarios
 
 TASK = "rl2grid/bus14-T0-v0"
 HEURISTIC = "idle"
-DECISIONS = 512_000
-"""Two to four minutes on two cores."""
+DECISIONS = 192_000
+"""Two to three minutes on two cores."""
 NUM_ENVS = 64
 """Enough to keep the cores busy while some environments play hours of calm between two decisions."""
 SEEDS = (0,)
