@@ -83,6 +83,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from rl2grid.algorithms.playing import Tally, of_transition, reported, resume_environments
 from rl2grid.envs.normalization import NormalizeObservation
 from rl2grid.errors import UsageError, one_of
 from rl2grid.mdp.constraints import THRESHOLDS
@@ -671,7 +672,7 @@ class LagrangianPPO:
         """Play ``num_steps`` decisions in every environment, learn from them, and return the metrics."""
         if self._observations is None:
             self._observations, infos = self.envs.reset(seed=self.args.seed * self.args.num_envs)
-            self._over = _info(infos, "over", np.zeros(self.args.num_envs, np.bool_))
+            self._over = reported(infos, "over", np.zeros(self.args.num_envs, np.bool_))
         rollout, episode_costs, playing_metrics = self.collect()
         multiplier_metrics = self.update_multipliers(episode_costs)
         learning_metrics = self.update(rollout)
@@ -680,7 +681,7 @@ class LagrangianPPO:
 
     def collect(self) -> tuple[Rollout, NDArray[np.float64], dict[str, float]]:
         """Play one rollout; returns also the costs of the episodes that ended in it, [episode, constraint]."""
-        tally = _Tally(self.constraints, self.thresholds)
+        tally = _CostTally(self.constraints, self.thresholds)
         steps = [self._play(tally) for _ in range(self.args.num_steps)]
         columns = [None if column[0] is None else torch.stack(column) for column in zip(*steps, strict=True)]
         rollout = Rollout(*columns)  # type: ignore[arg-type]
@@ -696,7 +697,7 @@ class LagrangianPPO:
         )
         return rollout, tally.episode_costs(), {**tally.metrics(), "charts/grid_steps": float(self.grid_steps)}
 
-    def _play(self, tally: _Tally) -> Rollout:
+    def _play(self, tally: _CostTally) -> Rollout:
         """One decision in every environment: a slice of a rollout, its ``next_values`` known where episodes ended."""
         args, network = self.args, self.network
         observations = self._tensor(self._observations, torch.float32)
@@ -712,9 +713,9 @@ class LagrangianPPO:
         seconds = time.perf_counter() - begin
 
         ended = terminated | truncated
-        self._over = _info(infos, "over", np.zeros_like(ended)) & ended
-        n_steps = _of_transition(infos, "n_steps", ended, np.ones(args.num_envs, np.int64))
-        discounted = _of_transition(infos, "discounted_reward", ended, np.where(n_steps == 1, rewards, np.nan))
+        self._over = reported(infos, "over", np.zeros_like(ended)) & ended
+        n_steps = of_transition(infos, "n_steps", ended, np.ones(args.num_envs, np.int64))
+        discounted = of_transition(infos, "discounted_reward", ended, np.where(n_steps == 1, rewards, np.nan))
         if np.isnan(discounted).any():
             raise UsageError(
                 "The environment plays several grid steps per decision without info['discounted_reward']: "
@@ -863,12 +864,7 @@ class LagrangianPPO:
         self._episode_return = np.array(state["episode_return"])
         self._episode_length = np.array(state["episode_length"])
         self._episode_costs = np.array(state["episode_costs"])
-        observations, _ = self.envs.load_state_dict(state["envs"])  # type: ignore[attr-defined]
-        if not np.array_equal(observations, self._observations):
-            raise UsageError(
-                "The environments do not come back to the observations of the checkpoint: it can only be resumed with "
-                "the data and the library versions that it was made with."
-            )
+        resume_environments(self.envs, state["envs"], self._observations)
 
     def _playable(self, actions: Tensor) -> NDArray[Any]:
         """What the environments are given: ids, or the actions clipped into their box."""
@@ -909,42 +905,14 @@ class LagrangianPPO:
         return loss._replace(total=loss.total.detach())
 
 
-class _Tally:
-    """What happened during a rollout, for the metrics."""
+class _CostTally(Tally):
+    """What happened during a rollout, costs of the episodes that ended included."""
 
     def __init__(self, constraints: tuple[str, ...], thresholds: NDArray[np.float64]) -> None:
+        super().__init__()
         self._constraints, self._thresholds = constraints, thresholds
         self._costs: list[NDArray[np.float64]] = []
         self._safe: list[bool] = []
-        self._began = time.perf_counter()
-        self._environment_seconds = 0.0
-        self._decisions = self._grid_steps = self._ineffective = 0
-        self._episodes: dict[str, list[float]] = {}
-
-    def note(
-        self,
-        n_steps: NDArray[np.int64],
-        seconds: float,
-        infos: Mapping[str, Any],
-        ended: NDArray[np.bool_],
-        episode_returns: NDArray[np.float64],
-        episode_lengths: NDArray[np.int64],
-    ) -> None:
-        """Count one decision per environment; the last two are of the episodes so far."""
-        self._decisions += len(n_steps)
-        self._grid_steps += int(n_steps.sum())
-        self._environment_seconds += seconds
-        nowhere = np.zeros_like(ended)
-        illegal = _of_transition(infos, "illegal", ended, nowhere)
-        ambiguous = _of_transition(infos, "ambiguous", ended, nowhere)
-        self._ineffective += int((illegal | ambiguous).sum())
-        if not ended.any():
-            return
-        self._episodes.setdefault("charts/episodic_return", []).extend(episode_returns[ended].tolist())
-        self._episodes.setdefault("charts/episodic_length", []).extend(episode_lengths[ended].tolist())
-        survival = infos.get("final_info", {}).get("survival")
-        if survival is not None:
-            self._episodes.setdefault("charts/survival", []).extend(np.asarray(survival)[ended].tolist())
 
     def note_costs(
         self, ended: NDArray[np.bool_], completed: NDArray[np.bool_], episode_costs: NDArray[np.float64]
@@ -960,18 +928,13 @@ class _Tally:
 
     def metrics(self) -> dict[str, float]:
         """Means over decisions and over the episodes that ended (none of the latter if none did)."""
-        safety: dict[str, float] = {}
-        if self._costs:
-            names = _metric_names("charts/episodic_cost", self._constraints)
-            safety |= zip(names, self.episode_costs().mean(axis=0).tolist(), strict=True)
-            safety["charts/safe_episodes"] = float(np.mean(self._safe))
+        if not self._costs:
+            return super().metrics()
+        names = _metric_names("charts/episodic_cost", self._constraints)
         return {
-            **{name: float(np.mean(values)) for name, values in self._episodes.items()},
-            **safety,
-            "charts/episodes": float(len(self._episodes.get("charts/episodic_return", ()))),
-            "charts/n_steps_per_decision": self._grid_steps / self._decisions,
-            "charts/ineffective_actions": self._ineffective / self._decisions,
-            "charts/environment_share": self._environment_seconds / (time.perf_counter() - self._began),
+            **super().metrics(),
+            **dict(zip(names, self.episode_costs().mean(axis=0).tolist(), strict=True)),
+            "charts/safe_episodes": float(np.mean(self._safe)),
         }
 
 
@@ -1047,27 +1010,11 @@ def _costs_of_transition(
     """Sums of the costs over all grid steps of the transitions just played [num_envs, constraint], not scaled."""
     missing = np.full(len(ended), np.nan)
     playing, last = infos.get("costs", {}), infos.get("final_info", {}).get("costs", {})
-    columns = [np.where(ended, _info(last, name, missing), _info(playing, name, missing)) for name in constraints]
+    columns = [np.where(ended, reported(last, name, missing), reported(playing, name, missing)) for name in constraints]
     costs = np.stack(columns, axis=1)
     if np.isnan(costs).any():
         raise UsageError(f"The environment does not report info['costs'] of {', '.join(constraints)}.")
     return costs
-
-
-def _info(infos: Mapping[str, Any], key: str, missing: NDArray[Any]) -> NDArray[Any]:
-    """An array of ``infos``, with the values of ``missing`` where an environment reported none."""
-    if key not in infos:
-        return missing
-    return np.where(infos.get(f"_{key}", True), infos[key], missing)
-
-
-def _of_transition(infos: Mapping[str, Any], key: str, ended: NDArray[np.bool_], missing: NDArray[Any]) -> NDArray[Any]:
-    """What ``infos`` tell about the transitions just played [num_envs].
-
-    Where an episode ended, ``infos`` already describe the next one; its last transition is in ``final_info``.
-    """
-    last = _info(infos.get("final_info", {}), key, missing)
-    return np.where(ended, last, _info(infos, key, missing))
 
 
 def _mean(scalars: Iterable[Tensor]) -> float:

@@ -49,6 +49,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from rl2grid.algorithms.playing import Tally, of_transition, reported, resume_environments
 from rl2grid.algorithms.replay import ReplayMemory, Step, computer_memory
 from rl2grid.envs.normalization import ObservationNormalizer
 from rl2grid.errors import UsageError, one_of
@@ -323,9 +324,9 @@ class OffPolicyTrainer(ABC):
         """Play ``num_steps`` decisions in every environment, learning on the way, and return the metrics."""
         if self._observations is None:
             observations, infos = self.envs.reset(seed=self.args.seed * self.args.num_envs)
-            self._over = _info(infos, "over", np.zeros(self.args.num_envs, np.bool_))
+            self._over = reported(infos, "over", np.zeros(self.args.num_envs, np.bool_))
             self._see(observations)
-        tally, history = _Tally(), _History()
+        tally, history = Tally(), _History()
         for _ in range(self.args.num_steps):
             self._play(tally)
             self._improve(history)
@@ -403,12 +404,7 @@ class OffPolicyTrainer(ABC):
         self._over = np.array(state["over"])
         self._episode_return = np.array(state["episode_return"])
         self._episode_length = np.array(state["episode_length"])
-        observations, _ = self.envs.load_state_dict(state["envs"])  # type: ignore[attr-defined]
-        if not np.array_equal(observations, self._observations):
-            raise UsageError(
-                "The environments do not come back to the observations of the checkpoint: it can only be resumed with "
-                "the data and the library versions that it was made with."
-            )
+        resume_environments(self.envs, state["envs"], self._observations)
 
     def _see(self, observations: NDArray[np.float32]) -> None:
         """Take over what the environments show: each observation enters the statistics once."""
@@ -417,7 +413,7 @@ class OffPolicyTrainer(ABC):
         if self.normalizer is not None:
             self.normalizer.update(self._observations)
 
-    def _play(self, tally: _Tally) -> None:
+    def _play(self, tally: Tally) -> None:
         """One decision in every environment, remembered."""
         args, observations = self.args, self._observations
         assert observations is not None
@@ -433,9 +429,9 @@ class OffPolicyTrainer(ABC):
         seconds = time.perf_counter() - begin
 
         ended = terminated | truncated
-        self._over = _info(infos, "over", np.zeros_like(ended)) & ended
-        n_steps = _of_transition(infos, "n_steps", ended, np.ones(args.num_envs, np.int64))
-        discounted = _of_transition(infos, "discounted_reward", ended, np.where(n_steps == 1, rewards, np.nan))
+        self._over = reported(infos, "over", np.zeros_like(ended)) & ended
+        n_steps = of_transition(infos, "n_steps", ended, np.ones(args.num_envs, np.int64))
+        discounted = of_transition(infos, "discounted_reward", ended, np.where(n_steps == 1, rewards, np.nan))
         if np.isnan(discounted).any():
             raise UsageError(
                 "The environment plays several grid steps per decision without info['discounted_reward']: "
@@ -499,51 +495,6 @@ class _History:
         return {name: float(torch.stack(values).to(torch.float64).mean()) for name, values in self._values.items()}
 
 
-class _Tally:
-    """What happened during an iteration, for the metrics."""
-
-    def __init__(self) -> None:
-        self._began = time.perf_counter()
-        self._environment_seconds = 0.0
-        self._decisions = self._grid_steps = self._ineffective = 0
-        self._episodes: dict[str, list[float]] = {}
-
-    def note(
-        self,
-        n_steps: NDArray[np.int64],
-        seconds: float,
-        infos: Mapping[str, Any],
-        ended: NDArray[np.bool_],
-        episode_returns: NDArray[np.float64],
-        episode_lengths: NDArray[np.int64],
-    ) -> None:
-        """Count one decision per environment; the last two are of the episodes so far."""
-        self._decisions += len(n_steps)
-        self._grid_steps += int(n_steps.sum())
-        self._environment_seconds += seconds
-        nowhere = np.zeros_like(ended)
-        illegal = _of_transition(infos, "illegal", ended, nowhere)
-        ambiguous = _of_transition(infos, "ambiguous", ended, nowhere)
-        self._ineffective += int((illegal | ambiguous).sum())
-        if not ended.any():
-            return
-        self._episodes.setdefault("charts/episodic_return", []).extend(episode_returns[ended].tolist())
-        self._episodes.setdefault("charts/episodic_length", []).extend(episode_lengths[ended].tolist())
-        survival = infos.get("final_info", {}).get("survival")
-        if survival is not None:
-            self._episodes.setdefault("charts/survival", []).extend(np.asarray(survival)[ended].tolist())
-
-    def metrics(self) -> dict[str, float]:
-        """Means over decisions and over the episodes that ended (none of the latter if none did)."""
-        return {
-            **{name: float(np.mean(values)) for name, values in self._episodes.items()},
-            "charts/episodes": float(len(self._episodes.get("charts/episodic_return", ()))),
-            "charts/n_steps_per_decision": self._grid_steps / self._decisions,
-            "charts/ineffective_actions": self._ineffective / self._decisions,
-            "charts/environment_share": self._environment_seconds / (time.perf_counter() - self._began),
-        }
-
-
 def find_device(name: str) -> torch.device:
     """The device that ``name`` asks for.
 
@@ -575,19 +526,3 @@ def _check_environments(args: OffPolicyArgs, envs: VectorEnv[Any, Any, Any]) -> 
     if not (np.all(space.low == -1.0) and np.all(space.high == 1.0)):
         raise UsageError(f"{name} plays continuous actions in Box(-1, 1), which this environment does not have.")
     return True
-
-
-def _info(infos: Mapping[str, Any], key: str, missing: NDArray[Any]) -> NDArray[Any]:
-    """An array of ``infos``, with the values of ``missing`` where an environment reported none."""
-    if key not in infos:
-        return missing
-    return np.where(infos.get(f"_{key}", True), infos[key], missing)
-
-
-def _of_transition(infos: Mapping[str, Any], key: str, ended: NDArray[np.bool_], missing: NDArray[Any]) -> NDArray[Any]:
-    """What ``infos`` tell about the transitions just played [num_envs].
-
-    Where an episode ended, ``infos`` already describe the next one; its last transition is in ``final_info``.
-    """
-    last = _info(infos.get("final_info", {}), key, missing)
-    return np.where(ended, last, _info(infos, key, missing))

@@ -51,6 +51,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from rl2grid.algorithms.playing import Tally, of_transition, reported, resume_environments
 from rl2grid.envs.normalization import NormalizeObservation
 from rl2grid.errors import UsageError, one_of
 
@@ -504,7 +505,7 @@ class PPO:
         """Play ``num_steps`` decisions in every environment, learn from them, and return the metrics."""
         if self._observations is None:
             self._observations, infos = self.envs.reset(seed=self.args.seed * self.args.num_envs)
-            self._over = _info(infos, "over", np.zeros(self.args.num_envs, np.bool_))
+            self._over = reported(infos, "over", np.zeros(self.args.num_envs, np.bool_))
         rollout, playing_metrics = self.collect()
         learning_metrics = self.update(rollout)
         self.iteration += 1
@@ -512,7 +513,7 @@ class PPO:
 
     def collect(self) -> tuple[Rollout, dict[str, float]]:
         """Play one rollout."""
-        tally = _Tally()
+        tally = Tally()
         steps = [self._play(tally) for _ in range(self.args.num_steps)]
         columns = [None if column[0] is None else torch.stack(column) for column in zip(*steps, strict=True)]
         rollout = Rollout(*columns)  # type: ignore[arg-type]
@@ -522,7 +523,7 @@ class PPO:
         rollout = rollout._replace(next_values=torch.where(rollout.ended, rollout.next_values, following))
         return rollout, {**tally.metrics(), "charts/grid_steps": float(self.grid_steps)}
 
-    def _play(self, tally: _Tally) -> Rollout:
+    def _play(self, tally: Tally) -> Rollout:
         """One decision in every environment: a slice of a rollout, its ``next_values`` known where episodes ended."""
         args, network = self.args, self.network
         observations = self._tensor(self._observations, torch.float32)
@@ -538,9 +539,9 @@ class PPO:
         seconds = time.perf_counter() - begin
 
         ended = terminated | truncated
-        self._over = _info(infos, "over", np.zeros_like(ended)) & ended
-        n_steps = _of_transition(infos, "n_steps", ended, np.ones(args.num_envs, np.int64))
-        discounted = _of_transition(infos, "discounted_reward", ended, np.where(n_steps == 1, rewards, np.nan))
+        self._over = reported(infos, "over", np.zeros_like(ended)) & ended
+        n_steps = of_transition(infos, "n_steps", ended, np.ones(args.num_envs, np.int64))
+        discounted = of_transition(infos, "discounted_reward", ended, np.where(n_steps == 1, rewards, np.nan))
         if np.isnan(discounted).any():
             raise UsageError(
                 "The environment plays several grid steps per decision without info['discounted_reward']: "
@@ -652,12 +653,7 @@ class PPO:
         self._over = np.array(state["over"])
         self._episode_return = np.array(state["episode_return"])
         self._episode_length = np.array(state["episode_length"])
-        observations, _ = self.envs.load_state_dict(state["envs"])  # type: ignore[attr-defined]
-        if not np.array_equal(observations, self._observations):
-            raise UsageError(
-                "The environments do not come back to the observations of the checkpoint: it can only be resumed with "
-                "the data and the library versions that it was made with."
-            )
+        resume_environments(self.envs, state["envs"], self._observations)
 
     def _playable(self, actions: Tensor) -> NDArray[Any]:
         """What the environments are given: ids, or the actions clipped into their box."""
@@ -692,51 +688,6 @@ class PPO:
             nn.utils.clip_grad_norm_(parameters, self.args.max_grad_norm)
         self.optimizer.step()
         return loss._replace(total=loss.total.detach())
-
-
-class _Tally:
-    """What happened during a rollout, for the metrics."""
-
-    def __init__(self) -> None:
-        self._began = time.perf_counter()
-        self._environment_seconds = 0.0
-        self._decisions = self._grid_steps = self._ineffective = 0
-        self._episodes: dict[str, list[float]] = {}
-
-    def note(
-        self,
-        n_steps: NDArray[np.int64],
-        seconds: float,
-        infos: Mapping[str, Any],
-        ended: NDArray[np.bool_],
-        episode_returns: NDArray[np.float64],
-        episode_lengths: NDArray[np.int64],
-    ) -> None:
-        """Count one decision per environment; the last two are of the episodes so far."""
-        self._decisions += len(n_steps)
-        self._grid_steps += int(n_steps.sum())
-        self._environment_seconds += seconds
-        nowhere = np.zeros_like(ended)
-        illegal = _of_transition(infos, "illegal", ended, nowhere)
-        ambiguous = _of_transition(infos, "ambiguous", ended, nowhere)
-        self._ineffective += int((illegal | ambiguous).sum())
-        if not ended.any():
-            return
-        self._episodes.setdefault("charts/episodic_return", []).extend(episode_returns[ended].tolist())
-        self._episodes.setdefault("charts/episodic_length", []).extend(episode_lengths[ended].tolist())
-        survival = infos.get("final_info", {}).get("survival")
-        if survival is not None:
-            self._episodes.setdefault("charts/survival", []).extend(np.asarray(survival)[ended].tolist())
-
-    def metrics(self) -> dict[str, float]:
-        """Means over decisions and over the episodes that ended (none of the latter if none did)."""
-        return {
-            **{name: float(np.mean(values)) for name, values in self._episodes.items()},
-            "charts/episodes": float(len(self._episodes.get("charts/episodic_return", ()))),
-            "charts/n_steps_per_decision": self._grid_steps / self._decisions,
-            "charts/ineffective_actions": self._ineffective / self._decisions,
-            "charts/environment_share": self._environment_seconds / (time.perf_counter() - self._began),
-        }
 
 
 def explained_variance(values: Tensor, returns: Tensor) -> float:
@@ -777,22 +728,6 @@ def _check_environments(args: Args, envs: VectorEnv[Any, Any, Any]) -> bool:
     if not (np.all(space.low == -1.0) and np.all(space.high == 1.0)):
         raise UsageError("PPO plays continuous actions in Box(-1, 1), which this environment does not have.")
     return True
-
-
-def _info(infos: Mapping[str, Any], key: str, missing: NDArray[Any]) -> NDArray[Any]:
-    """An array of ``infos``, with the values of ``missing`` where an environment reported none."""
-    if key not in infos:
-        return missing
-    return np.where(infos.get(f"_{key}", True), infos[key], missing)
-
-
-def _of_transition(infos: Mapping[str, Any], key: str, ended: NDArray[np.bool_], missing: NDArray[Any]) -> NDArray[Any]:
-    """What ``infos`` tell about the transitions just played [num_envs].
-
-    Where an episode ended, ``infos`` already describe the next one; its last transition is in ``final_info``.
-    """
-    last = _info(infos.get("final_info", {}), key, missing)
-    return np.where(ended, last, _info(infos, key, missing))
 
 
 def _mean(scalars: Iterable[Tensor]) -> float:
