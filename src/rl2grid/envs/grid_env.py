@@ -186,6 +186,14 @@ class PowerGridEnv(gymnasium.Env[NDArray[np.float32], Any], TaskDescription):
         """
         return self._player.security(0)
 
+    def n_minus_1_score(self) -> float:
+        """Share of the lines in service whose loss would leave neither an overload nor a collapse.
+
+        Raises:
+            UsageError: no episode in progress, or the reference engine.
+        """
+        return self._player.n_minus_1_score(0)
+
     def action_masks(self) -> NDArray[np.bool_]:
         """Which discrete actions are legal now, bool [action].
 

@@ -34,7 +34,7 @@ from rl2grid.scenarios.episodes import EpisodePlan, plan_episode
 
 if TYPE_CHECKING:
     from rl2grid.engines.native.engine import NativeEngine
-    from rl2grid.engines.native.what_if import ActionOutcomes, OutageOutcomes, WhatIf
+    from rl2grid.engines.native.what_if import ActionOutcomes, OutageOutcomes
 
 _RESET_OPTIONS = ("scenario", "start")
 
@@ -100,7 +100,6 @@ class TaskPlayer:
         self._hash = action_set_hash(self.grid, task.level) if task.kind == "T" else None
         self._plans: list[EpisodePlan | None] = [None] * n
         self._seats: list[Seat | None] = [None] * n
-        self._solver: WhatIf | None = None
         self._pending = np.zeros(n, np.bool_)  # the episode ended inside reset, its ending is still to be returned
 
     @property
@@ -196,12 +195,15 @@ class TaskPlayer:
 
     def security(self, i: int) -> OutageOutcomes:
         """What the loss of each line would do now; see :meth:`PowerGridEnv.security`."""
-        from rl2grid.engines.native.what_if import WhatIf, snapshot_of
+        from rl2grid.engines.native.what_if import outages
 
-        engine = self._native_engine(i)
-        if self._solver is None:
-            self._solver = WhatIf(self.grid, engine.arrays.network)
-        return self._solver.outages(snapshot_of(engine, i))
+        return outages(self._native_engine(i), i)
+
+    def n_minus_1_score(self, i: int) -> float:
+        """Share of the outages that leave the grid safe; see :meth:`PowerGridEnv.n_minus_1_score`."""
+        from rl2grid.engines.native.what_if import n_minus_1_score
+
+        return n_minus_1_score(self._native_engine(i), i)
 
     def _native_engine(self, i: int) -> NativeEngine:
         if self._plans[i] is None or self.is_over(i):

@@ -36,14 +36,8 @@ class SecurityReward(gymnasium.Wrapper[NDArray[np.float32], Any, NDArray[np.floa
     def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Step the environment, and score where it leads."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        score = 0.0 if terminated or truncated or info["over"] else self._score()
+        score = 0.0 if terminated or truncated or info["over"] else self._base.n_minus_1_score()
         security = self._weight * score
         info["n_minus_1"] = score
         info["reward_components"] = {**info["reward_components"], "security": security}
         return observation, float(reward) + security, terminated, truncated, info
-
-    def _score(self) -> float:
-        outages = self._base.security()
-        lost = ~outages.was_open
-        safe = lost & (outages.verdict == 0) & (outages.overloads == 0)
-        return float(safe.sum()) / max(int(lost.sum()), 1)

@@ -226,6 +226,11 @@ def what_if(
     return _solver_of(engine, num_threads).actions(snapshot, catalogue, ids)
 
 
+def outages(engine: NativeEngine, i: int) -> OutageOutcomes:
+    """The flow after the loss of each line in environment ``i``, as last observed; see :meth:`WhatIf.outages`."""
+    return _solver_of(engine, 1).outages(snapshot_of(engine, i))
+
+
 def n_minus_1_score(engine: NativeEngine, i: int) -> float:
     """Share of the lines in service whose loss would leave neither an overload nor a collapse."""
     security = _solver_of(engine, 1).security(snapshot_of(engine, i))
