@@ -1,8 +1,8 @@
 """Compilation of the small numerical functions, cached on disk between runs.
 
 Numba's on-disk cache notices an edit of the file that defines a function, but not of the functions
-that it calls. The cache directory is therefore keyed by a hash of the package's sources and by
-Numba's version: an edit anywhere begins a fresh cache, and nothing stale is ever run.
+that it calls. The cache directory is therefore keyed by a hash of the sources and by Numba's version:
+an edit begins a fresh cache, and nothing stale is ever run. Layers without compiled functions do not count.
 """
 
 from __future__ import annotations
@@ -18,14 +18,20 @@ import platformdirs
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
+INTERPRETED_LAYERS = ("agents", "algorithms", "analysis", "cli", "envs", "experiments")
+"""Subpackages without compiled functions: an edit of them leaves the compiled ones what they are."""
+
 
 @functools.cache
 def cache_directory() -> Path:
-    """Where compiled code of exactly these sources is kept."""
+    """Where compiled code of exactly the present sources is kept."""
     package = Path(__file__).resolve().parent
     digest = hashlib.sha256(numba.__version__.encode())
     for path in sorted(package.rglob("*.py")):
-        digest.update(path.relative_to(package).as_posix().encode())
+        name = path.relative_to(package)
+        if name.parts[0] in INTERPRETED_LAYERS:
+            continue
+        digest.update(name.as_posix().encode())
         digest.update(path.read_bytes())
     return Path(platformdirs.user_cache_dir("rl2grid")) / "numba" / digest.hexdigest()[:16]
 
