@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from sample_results import curve, recording, result
 
-from rl2grid.analysis.figures import DARK, LIGHT, episode_loading, save_figure, survival_by_agent, training_curves
+from rl2grid.analysis.figures import episode_loading, save_figure, survival_by_agent, training_curves
 from rl2grid.analysis.report import write_report
+from rl2grid.drawing.theme import DARK, LIGHT
 from rl2grid.errors import UsageError
 
 RESULTS = [result("do-nothing", [[0.2, 0.3], [0.1, 0.4]]), result("ppo", [[1.0, 0.9], [0.8, 1.0]], "idle")]

@@ -26,9 +26,9 @@ from rl2grid.analysis.action_space import (
     topology_after,
     wilson_interval,
 )
-from rl2grid.analysis.figures import LIGHT, Theme
-from rl2grid.analysis.grid_drawing import GridDrawing, add_legend, reference_scene
 from rl2grid.analysis.statistics import Floats
+from rl2grid.drawing.grid_drawing import GridDrawing, add_legend, reference_scene
+from rl2grid.drawing.theme import LIGHT, Theme, style
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
 from rl2grid.grids.rankings import Trials, ranking, trials
@@ -51,7 +51,7 @@ def draw_shares(grid: Grid, *, theme: Theme = LIGHT) -> Figure:
     shares = substation_shares(grid)
     n_levels, place = len(grid.level_sizes), np.arange(len(shares))
     apart = len(shares) + max(0.5, 0.02 * len(shares))
-    with matplotlib.rc_context(figures.style(theme)):
+    with matplotlib.rc_context(style(theme)):
         figure = Figure(figsize=(float(np.clip(0.16 * len(shares) + 1.5, 6.4, 11.0)), 1.35 * n_levels + 1.1),
                         layout="constrained")  # fmt: skip
         _close_rows(figure)
@@ -103,7 +103,7 @@ def draw_trials(grid: Grid, *, theme: Theme = LIGHT) -> Figure:
     counts = trials(grid.id).trials[1:].astype(np.float64)
     pools = np.array_split(np.arange(len(counts)), min(len(counts), MAX_POINTS))
     position = [1 + pool.mean() for pool in pools]
-    with matplotlib.rc_context(figures.style(theme)):
+    with matplotlib.rc_context(style(theme)):
         figure = Figure(figsize=(6.4, 3.2), layout="constrained")
         axes, side = figure.subplots(1, 2, sharey=True, gridspec_kw={"width_ratios": [4, 1], "wspace": 0.02})
         if len(pools) < len(counts):
@@ -147,7 +147,7 @@ def draw_ranking(grid: Grid, *, theme: Theme = LIGHT) -> Figure:
     logarithmic = len(ids) >= LOGARITHMIC_FROM
     pools = _rank_pools(len(ids), logarithmic)
     position = np.array([1 + pool.mean() for pool in pools])
-    with matplotlib.rc_context(figures.style(theme)):
+    with matplotlib.rc_context(style(theme)):
         figure = Figure(figsize=(6.4, 4.2), layout="constrained")
         upper, lower = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": [2.2, 1]})
         _close_rows(figure)
@@ -189,7 +189,7 @@ def draw_action(grid: Grid, action: StepAction, *, theme: Theme = LIGHT) -> Figu
         "from the reference topology, everything in service and on busbar 1; yellow: what the action changes; "
         "bars: busbar 1 above, busbar 2 below"
     )
-    with matplotlib.rc_context(figures.style(theme)):
+    with matplotlib.rc_context(style(theme)):
         figure = Figure(figsize=(12.0, 4.6))
         overview = figure.add_axes((0.01, 0.08, 0.415, 0.76))
         GridDrawing(grid, overview, theme=theme).show(before)

@@ -10,14 +10,13 @@ import io
 import itertools
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import Colormap, LinearSegmentedColormap, ListedColormap, Normalize
+from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -28,10 +27,19 @@ from rl2grid.analysis.recordings import Recording
 from rl2grid.analysis.results import EvaluationResult
 from rl2grid.analysis.statistics import Floats, bootstrap_band, trailing_mean
 from rl2grid.analysis.training import TrainingCurve
+from rl2grid.drawing.theme import (
+    FULL_SCALE,
+    GREEN,
+    LIGHT,
+    PURPLE,
+    SAFE_LOADING,
+    VERMILLION,
+    Theme,
+    loading_colours,
+    style,
+)
 
-BLUE, VERMILLION, GREEN, ORANGE, SKY, PURPLE = "#0072B2", "#D55E00", "#009E73", "#E69F00", "#56B4E9", "#CC79A7"
 STEPS_PER_DAY = 288
-SAFE_LOADING, FULL_SCALE = 1.0, 1.5
 MAX_COLUMNS = 360
 """Columns of a heatmap: more steps are pooled, each pool showing its highest loading, so that an overload of one
 step is wide enough to be seen."""
@@ -39,45 +47,6 @@ MAX_LABELS = 40
 CURVE_POINTS = 200
 SMOOTHING_SHARE = 20
 """Curves are smoothed over one part in this many of their points."""
-
-
-@dataclass(frozen=True)
-class Theme:
-    """Colours of paper and ink."""
-
-    name: str
-    background: str
-    text: str
-    muted: str
-    rule: str
-    loading: tuple[str, ...]
-    """From a line without load to one at its limit."""
-    out: str
-    """A line out of service."""
-    series: tuple[str, ...]
-    """Of lines and dots, in order of use."""
-
-
-LIGHT = Theme(
-    name="light",
-    background="#ffffff",
-    text="#1b1f24",
-    muted="#667079",
-    rule="#e4e7ea",
-    loading=("#f4f7fa", "#a9cbe6", "#4a8fc7", "#0b3866"),
-    out="#b9bec4",
-    series=(BLUE, VERMILLION, GREEN, ORANGE, PURPLE, SKY),
-)
-DARK = Theme(
-    name="dark",
-    background="#15181c",
-    text="#e8eaed",
-    muted="#9aa3ad",
-    rule="#30363d",
-    loading=("#1b232c", "#1f4f7d", "#4a8fc7", "#b5dcff"),
-    out="#5b626b",
-    series=(SKY, ORANGE, GREEN, PURPLE, VERMILLION, BLUE),
-)
 
 
 def training_curves(
@@ -187,53 +156,6 @@ def save_figure(figure: Figure, path: Path, *, formats: Sequence[str] = ("png", 
 def png_bytes(figure: Figure) -> bytes:
     """A figure as PNG."""
     return _render(figure, "png")
-
-
-def style(theme: Theme) -> dict[str, Any]:
-    """Settings of Matplotlib for figures in a theme, for :func:`matplotlib.rc_context`."""
-    return {
-        "figure.facecolor": theme.background,
-        "axes.facecolor": theme.background,
-        "savefig.facecolor": theme.background,
-        "text.color": theme.text,
-        "axes.labelcolor": theme.text,
-        "axes.titlecolor": theme.text,
-        "xtick.color": theme.muted,
-        "ytick.color": theme.muted,
-        "xtick.labelcolor": theme.text,
-        "ytick.labelcolor": theme.text,
-        "axes.edgecolor": theme.muted,
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "axes.linewidth": 0.8,
-        "axes.axisbelow": True,
-        "grid.color": theme.rule,
-        "grid.linewidth": 0.8,
-        "font.family": "DejaVu Sans",
-        "font.size": 9,
-        "axes.labelsize": 9,
-        "xtick.labelsize": 8,
-        "ytick.labelsize": 8,
-        "legend.fontsize": 8,
-        "legend.frameon": True,
-        "legend.facecolor": theme.background,
-        "legend.edgecolor": theme.rule,
-        "legend.framealpha": 0.9,
-        "figure.constrained_layout.w_pad": 0.12,
-        "figure.constrained_layout.h_pad": 0.12,
-        "pdf.fonttype": 42,
-    }
-
-
-def loading_colours(theme: Theme) -> Colormap:
-    """Colours of loadings from 0 to :data:`FULL_SCALE`, which change at :data:`SAFE_LOADING`."""
-    """Up to the limit from empty to full, beyond it another hue: an overload is never a shade of normal."""
-    below = LinearSegmentedColormap.from_list("below", theme.loading)
-    above = LinearSegmentedColormap.from_list("above", ["#F28E2B", VERMILLION, "#A50F15"])
-    n = 300
-    limit = round(n * SAFE_LOADING / FULL_SCALE)
-    colours = [below(k / (limit - 1)) for k in range(limit)] + [above(k / (n - limit - 1)) for k in range(n - limit)]
-    return ListedColormap(colours).with_extremes(bad=theme.out, over="#7A0010")
 
 
 def _render(figure: Figure, suffix: str) -> bytes:

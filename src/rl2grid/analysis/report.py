@@ -20,11 +20,11 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from rl2grid.analysis import figures, tables
-from rl2grid.analysis.figures import DARK, LIGHT, Theme
 from rl2grid.analysis.recordings import Recording
 from rl2grid.analysis.results import EvaluationResult, check_comparable, identity_hash
 from rl2grid.analysis.summary import Summary
 from rl2grid.analysis.training import TrainingCurve
+from rl2grid.drawing.theme import DARK, LIGHT, Theme
 
 REPORT_FILE, TABLE_FILE, FIGURES_FOLDER = "report.html", "results.md", "figures"
 

@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from rl2grid.analysis import report
-from rl2grid.analysis.figures import DARK, LIGHT, Theme, png_bytes, style
+from rl2grid.analysis.figures import png_bytes
+from rl2grid.drawing.theme import DARK, LIGHT, Theme, style
 from rl2grid.errors import UsageError
 from rl2grid.grids import STEPS_PER_HOUR, Grid
 from rl2grid.scenarios.generated import MONTHS, VERSION, generator_fingerprint, month_name

@@ -37,8 +37,8 @@ from matplotlib.textpath import TextPath
 from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
-from rl2grid.analysis import figures
-from rl2grid.analysis.figures import FULL_SCALE, GREEN, LIGHT, PURPLE, Theme
+from rl2grid.drawing import theme as themes
+from rl2grid.drawing.theme import FULL_SCALE, GREEN, LIGHT, PURPLE, Theme, style
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
 
@@ -353,7 +353,7 @@ class FrameRenderer:
     """
 
     def __init__(self, grid: Grid, *, size: tuple[int, int] = (1280, 720), theme: Theme = LIGHT) -> None:
-        with matplotlib.rc_context(figures.style(theme)):
+        with matplotlib.rc_context(style(theme)):
             figure = Figure(figsize=(size[0] / 100, size[1] / 100), dpi=100)
             self._canvas = FigureCanvasAgg(figure)
             self._axes = figure.add_axes((0.01, 0.07, 0.98, 0.92))
@@ -397,7 +397,7 @@ def add_legend(figure: Figure, grid: Grid, theme: Theme, *, known_loading: bool)
 @functools.cache
 def loading_colours(theme: Theme) -> Colormap:
     """Colours of lines over loadings 0 to :data:`FULL_SCALE`; even an empty line is seen on the background."""
-    return figures.loading_colours(dataclasses.replace(theme, loading=theme.loading[1:]))
+    return themes.loading_colours(dataclasses.replace(theme, loading=theme.loading[1:]))
 
 
 def _frame_axes(axes: Axes, geometry: _Geometry, substations: Sequence[int] | None, border: float) -> float:

@@ -7,14 +7,14 @@ import pytest
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
-from rl2grid.analysis.figures import DARK, GREEN, LIGHT, PURPLE
-from rl2grid.analysis.grid_drawing import (
+from rl2grid.drawing.grid_drawing import (
     FrameRenderer,
     GridDrawing,
     _geometry,
     loading_colours,
     reference_scene,
 )
+from rl2grid.drawing.theme import DARK, GREEN, LIGHT, PURPLE
 from rl2grid.errors import UsageError
 from rl2grid.grids import GRID_IDS, load_grid
 
