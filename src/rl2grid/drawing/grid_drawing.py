@@ -7,7 +7,7 @@
     line                   colour and width: loading; dashed: out of service
     circle with a wave     generator
     triangle               load
-    square                 storage unit
+    square                 storage unit; the size of all three symbols: MW, where they are known
 
 What never changes (places of symbols, courses of lines, numbers) is computed once; :meth:`GridDrawing.show` moves
 and colours what does. :class:`FrameRenderer` draws picture after picture, as animations need.
@@ -17,10 +17,11 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import textwrap
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
@@ -56,8 +57,12 @@ _BESIDE = 0.14
 """Distance of parallel lines."""
 _DIGIT = 0.22
 _DIRECTIONS = 32
+SMALLEST_SYMBOL, LARGEST_SYMBOL = 0.5, 1.6
+"""Sizes of symbols at no power and at the largest of the grid, as factors."""
 _APART = 0.3
 """Least distance of two symbols."""
+_SENTENCE_LENGTH = 170
+"""Letters that fit on one line of a caption."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +79,22 @@ class Scene:
     """[line] out for planned maintenance."""
     highlighted: Flags
     """[topo] elements that the picture is about."""
+    gen_p: NDArray[np.float32]
+    """[gen] MW; NaN where it is not known."""
+    load_p: NDArray[np.float32]
+    """[load] MW; NaN where it is not known."""
+    storage_power: NDArray[np.float32]
+    """[storage] MW; NaN where it is not known."""
+
+
+class Caption(NamedTuple):
+    """What is said above a picture."""
+
+    headline: str
+    sentence: str
+
+
+NO_CAPTION = Caption("", "")
 
 
 def reference_scene(grid: Grid) -> Scene:
@@ -85,7 +106,21 @@ def reference_scene(grid: Grid) -> Scene:
         attacked=no_line,
         maintained=no_line,
         highlighted=np.zeros(grid.dim_topo, np.bool_),
+        gen_p=np.full(grid.n_gen, np.nan, np.float32),
+        load_p=np.full(grid.n_load, np.nan, np.float32),
+        storage_power=np.full(grid.n_storage, np.nan, np.float32),
     )
+
+
+def symbol_scale(grid: Grid, power: NDArray[np.float32]) -> Points:
+    """How large symbols are for a power in MW: their area grows with it, and the smallest is still seen.
+
+    Returns:
+        Factors of the usual size, the shape of ``power``; 1 where the power is NaN.
+    """
+    largest = max(float(grid.gen_pmax.max()), float(grid.load_p_max.max()))
+    share = np.minimum(1.0, np.abs(power) / largest)
+    return np.where(np.isnan(power), 1.0, SMALLEST_SYMBOL + (LARGEST_SYMBOL - SMALLEST_SYMBOL) * np.sqrt(share))
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,9 +246,10 @@ class GridDrawing:
         self._bars = LineCollection([], colors=theme.text, linewidths=1.7 * self._width, capstyle="round")
         self._contacts = PolyCollection([], facecolors=theme.text, edgecolors="none")
         self._discs = PolyCollection([], facecolors=theme.background, edgecolors=theme.text, linewidths=self._edge)
+        self._outlines, self._inside = self._symbols()
         self.artists: tuple[Artist, ...] = (
             self._halo, self._halo_discs, self._out, self._lines, self._stubs, self._bars, self._contacts, self._discs,
-            *self._symbols(), self._numbers(),
+            self._outlines, self._inside, self._numbers(),
         )  # fmt: skip
         """From back to front."""
         for order, artist in enumerate(self.artists):
@@ -239,6 +275,7 @@ class GridDrawing:
         touching = split[grid.element_to_subid] & (scene.topo_vect > 0)
         self._contacts.set_verts(list(_circles(end[touching], 0.055 * self.unit)))
         self._discs.set_verts(list(_circles(geometry.centre[~split], _DISC * self.unit)))
+        self._show_symbols(scene)
 
     def beside(self, element: int, distance: float) -> tuple[float, float]:
         """The point at ``distance`` units from a substation, towards one of its elements (entry of ``topo_vect``)."""
@@ -306,25 +343,30 @@ class GridDrawing:
         self._halo.set_segments([*at_origin, *at_extremity, *stubs[symbols]])
         self._halo_discs.set_verts(list(_circles(self._geometry.symbol[symbols], 1.75 * _SYMBOL * self.unit)))
 
-    def _symbols(self) -> tuple[Artist, Artist]:
-        """Outlines and what is drawn inside them."""
-        grid, theme, place = self._grid, self._theme, self._geometry.symbol
-        size = _SYMBOL * self.unit
-        generator, load, storage = np.split(place, [grid.n_gen, grid.n_gen + grid.n_load])
-        outlines = [
-            *_circles(generator, size),
-            *(load[:, None] + size * np.array([[-1.0, 0.75], [1.0, 0.75], [0.0, -1.0]])),
-            *(storage[:, None] + 0.85 * size * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])),
-        ]
+    def _symbols(self) -> tuple[PolyCollection, LineCollection]:
+        """Outlines and what is drawn inside them; :meth:`_show_symbols` gives them places and sizes."""
+        grid, theme = self._grid, self._theme
         fills = [theme.background] * grid.n_gen + [theme.muted] * grid.n_load + [theme.background] * grid.n_storage
-        phase = np.linspace(-np.pi, np.pi, 13)
-        wave = size * np.stack((0.6 * phase / np.pi, 0.38 * np.sin(phase)), axis=1)
-        plates = 0.5 * size * np.array([[[-1.0, 0.35], [1.0, 0.35]], [[-0.5, -0.35], [0.5, -0.35]]])
-        inside = [*(generator[:, None] + wave), *(storage[:, None, None] + plates).reshape(-1, 2, 2)]
         return (
-            PolyCollection(outlines, facecolors=fills, edgecolors=theme.text, linewidths=self._edge),
-            LineCollection(inside, colors=theme.text, linewidths=0.85 * self._edge),
+            PolyCollection([], facecolors=fills, edgecolors=theme.text, linewidths=self._edge),
+            LineCollection([], colors=theme.text, linewidths=0.85 * self._edge),
         )
+
+    def _show_symbols(self, scene: Scene) -> None:
+        grid = self._grid
+        power = np.concatenate((scene.gen_p, scene.load_p, scene.storage_power))
+        size = (_SYMBOL * self.unit * symbol_scale(grid, power))[:, None, None]
+        parts = [grid.n_gen, grid.n_gen + grid.n_load]
+        generator, load, storage = np.split(self._geometry.symbol[:, None], parts)
+        of_generator, of_load, of_storage = np.split(size, parts)
+        outlines = (
+            generator + of_generator * _RING,
+            load + of_load * _TRIANGLE,
+            storage + of_storage * _SQUARE,
+        )
+        self._outlines.set_verts([outline for kind in outlines for outline in kind])
+        plates = storage[:, None] + of_storage[:, None] * _PLATES
+        self._inside.set_segments([*(generator + of_generator * _WAVE), *plates.reshape(-1, 2, 2)])
 
     def _numbers(self) -> Artist:
         """Numbers of the substations, as outlines of glyphs: drawn much faster than text, and scaled with the rest."""
@@ -353,22 +395,28 @@ class FrameRenderer:
     """
 
     def __init__(self, grid: Grid, *, size: tuple[int, int] = (1280, 720), theme: Theme = LIGHT) -> None:
+        # One width in inches whatever the size: letters shrink with the picture, and the legend fits.
+        dpi = 100 * size[0] / 1280
         with matplotlib.rc_context(style(theme)):
-            figure = Figure(figsize=(size[0] / 100, size[1] / 100), dpi=100)
+            figure = Figure(figsize=((size[0] + 0.01) / dpi, (size[1] + 0.01) / dpi), dpi=dpi)
             self._canvas = FigureCanvasAgg(figure)
-            self._axes = figure.add_axes((0.01, 0.07, 0.98, 0.92))
+            self._axes = figure.add_axes((0.01, 0.06, 0.98, 0.855))
             self._drawing = GridDrawing(grid, self._axes, theme=theme)
+            self._headline = figure.text(0.015, 0.975, "", fontsize=13, fontweight="bold", va="top", animated=True)
+            self._sentence = figure.text(0.015, 0.932, "", fontsize=10, va="top", animated=True)
             add_legend(figure, grid, theme, known_loading=True)
             for artist in self._drawing.artists:
                 artist.set_animated(True)
             self._canvas.draw()
         self._background = self._canvas.copy_from_bbox(figure.bbox)
 
-    def frame(self, scene: Scene) -> NDArray[np.uint8]:
+    def frame(self, scene: Scene, caption: Caption = NO_CAPTION) -> NDArray[np.uint8]:
         """A picture of ``scene``, uint8 [height, width, 3]."""
         self._drawing.show(scene)
+        self._headline.set_text(caption.headline)
+        self._sentence.set_text(textwrap.shorten(caption.sentence, _SENTENCE_LENGTH, placeholder=" …"))
         self._canvas.restore_region(self._background)
-        for artist in self._drawing.artists:
+        for artist in (*self._drawing.artists, self._headline, self._sentence):
             self._axes.draw_artist(artist)
         return np.array(self._canvas.buffer_rgba())[..., :3]
 
@@ -391,6 +439,8 @@ def add_legend(figure: Figure, grid: Grid, theme: Theme, *, known_loading: bool)
         handles.append(Line2D([], [], color=PURPLE, linestyle=(0, (3, 2)), label="attacked"))
         handles.append(Line2D([], [], color=GREEN, linestyle=(0, (3, 2)), label="maintenance"))
     handles.append(Line2D([], [], color=theme.out, linestyle=(0, (3, 2)), label="out"))
+    if known_loading:
+        handles.append(Line2D([], [], linestyle="", label="symbol size: MW"))
     figure.legend(handles=handles, loc="lower center", ncols=len(handles), frameon=False, handlelength=1.6)
 
 
@@ -398,6 +448,20 @@ def add_legend(figure: Figure, grid: Grid, theme: Theme, *, known_loading: bool)
 def loading_colours(theme: Theme) -> Colormap:
     """Colours of lines over loadings 0 to :data:`FULL_SCALE`; even an empty line is seen on the background."""
     return themes.loading_colours(dataclasses.replace(theme, loading=theme.loading[1:]))
+
+
+def _circles(centres: Points, radius: float) -> Points:
+    """Polygons [circle, corner, 2]."""
+    angle = np.linspace(0, 2 * np.pi, 25)[:-1]
+    return centres[:, None] + radius * np.stack((np.cos(angle), np.sin(angle)), axis=1)
+
+
+_RING = _circles(np.zeros((1, 2)), 1.0)[0]
+_TRIANGLE = np.array([[-1.0, 0.75], [1.0, 0.75], [0.0, -1.0]])
+_SQUARE = 0.85 * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+_PHASE = np.linspace(-np.pi, np.pi, 13)
+_WAVE = np.stack((0.6 * _PHASE / np.pi, 0.38 * np.sin(_PHASE)), axis=1)
+_PLATES = 0.5 * np.array([[[-1.0, 0.35], [1.0, 0.35]], [[-0.5, -0.35], [0.5, -0.35]]])
 
 
 def _frame_axes(axes: Axes, geometry: _Geometry, substations: Sequence[int] | None, border: float) -> float:
@@ -416,9 +480,3 @@ def _frame_axes(axes: Axes, geometry: _Geometry, substations: Sequence[int] | No
     figure = axes.get_figure()
     assert figure is not None
     return float(scale * geometry.unit * 72 / figure.dpi)
-
-
-def _circles(centres: Points, radius: float) -> Points:
-    """Polygons [circle, corner, 2]."""
-    angle = np.linspace(0, 2 * np.pi, 25)[:-1]
-    return centres[:, None] + radius * np.stack((np.cos(angle), np.sin(angle)), axis=1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from datetime import datetime
 from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium
@@ -12,9 +13,11 @@ from numpy.typing import NDArray
 from rl2grid.engines.transition import Listener
 from rl2grid.envs.player import SimulationResult, TaskDescription, TaskPlayer, single_spaces
 from rl2grid.envs.tasks import TaskOptions, find_task
+from rl2grid.errors import UsageError, one_of
 from rl2grid.mdp.state import GridState
 
 if TYPE_CHECKING:
+    from rl2grid.drawing.grid_drawing import FrameRenderer
     from rl2grid.engines.native.what_if import ActionOutcomes, OutageOutcomes
 
 
@@ -71,13 +74,13 @@ class PowerGridEnv(gymnasium.Env[NDArray[np.float32], Any], TaskDescription):
     ending.
 
     ## Arguments
-    See :class:`rl2grid.envs.tasks.TaskOptions`.
+    See :class:`rl2grid.envs.tasks.TaskOptions`; `render_mode="rgb_array"` makes `render` draw the grid.
 
     ## Information
     See :data:`rl2grid.envs.info.INFO_KEYS`.
     """  # noqa: E501
 
-    metadata = {"render_modes": []}  # noqa: RUF012 - Gymnasium's convention
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 12}  # noqa: RUF012 - Gymnasium's convention
 
     def __init__(
         self,
@@ -94,7 +97,13 @@ class PowerGridEnv(gymnasium.Env[NDArray[np.float32], Any], TaskDescription):
         gamma: float | None = None,
         maintenance: bool = True,
         opponent: bool = True,
+        render_mode: str | None = None,
     ) -> None:
+        if render_mode not in (None, "rgb_array"):
+            raise one_of("render_mode", render_mode, ("None", "rgb_array"))
+        self.render_mode = render_mode
+        self._renderer: FrameRenderer | None = None
+        self._last_action: Any = None
         self.task = find_task(task_id)
         self.options = TaskOptions(
             engine,
@@ -132,6 +141,7 @@ class PowerGridEnv(gymnasium.Env[NDArray[np.float32], Any], TaskDescription):
             UsageError: an option is unknown, or names a scenario or start that does not exist.
         """
         super().reset(seed=seed)
+        self._last_action = None
         self._player.reset(0, seed, options)
         return self._observation(), self._player.info(0)
 
@@ -143,6 +153,8 @@ class PowerGridEnv(gymnasium.Env[NDArray[np.float32], Any], TaskDescription):
         """
         player = self._player
         player.step(0, action)
+        if self.render_mode is not None:
+            self._last_action = np.array(action)
         ended = bool(player.state.terminated[0]), bool(player.state.truncated[0])
         return self._observation(), player.reward(0), *ended, player.info(0)
 
@@ -203,6 +215,37 @@ class PowerGridEnv(gymnasium.Env[NDArray[np.float32], Any], TaskDescription):
         mask = np.zeros(self.task.n_actions, np.bool_)
         self._player.write_action_mask(0, mask)
         return mask
+
+    @property
+    def clock(self) -> datetime:
+        """The time in the scenario of what :attr:`state` shows.
+
+        Raises:
+            UsageError: the environment was not reset yet.
+        """
+        return self._player.clock(0)
+
+    def render(self) -> NDArray[np.uint8]:  # type: ignore[override]
+        """The grid and what the agent did last as a picture, uint8 [720, 1280, 3].
+
+        Raises:
+            UsageError: the environment was not made with ``render_mode="rgb_array"`` or not reset yet, or Matplotlib
+                is not installed.
+        """
+        if self.render_mode is None:
+            raise UsageError('There is nothing to render to: make the environment with render_mode="rgb_array".')
+        # Imported here: playing needs no Matplotlib.
+        try:
+            from rl2grid.drawing import episode_frames, grid_drawing
+        except ImportError as error:
+            raise UsageError(
+                f"Rendering needs {error.name}: install it with `pip install rl2grid[analysis]`."
+            ) from None
+        if self._renderer is None:
+            self._renderer = grid_drawing.FrameRenderer(self.grid)
+        action = "" if self._last_action is None else self.describe_action(self._last_action)
+        caption = episode_frames.caption_of(self.grid, self.state, 0, self.clock, action)
+        return self._renderer.frame(episode_frames.scene_of(self.grid, self.state, 0), caption)
 
     def close(self) -> None:
         """Free the simulator."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from datetime import datetime
 from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium
@@ -31,6 +32,8 @@ from rl2grid.mdp.features import feature_slices, observation_size, observation_w
 from rl2grid.mdp.rewards import resolve_reward
 from rl2grid.mdp.state import GridState
 from rl2grid.scenarios.episodes import EpisodePlan, plan_episode
+from rl2grid.scenarios.library import load_scenario
+from rl2grid.scenarios.scenario import STEP
 
 if TYPE_CHECKING:
     from rl2grid.engines.native.engine import NativeEngine
@@ -179,6 +182,14 @@ class TaskPlayer:
         info["action_effect"] = effect or clipping(self.grid, result, 0, played)
         reward = float(result.transition_reward[0])
         return SimulationResult(observation, reward, info["cost"], bool(result.terminated[0]), info)
+
+    def clock(self, i: int) -> datetime:
+        """The time of what the state of row ``i`` shows."""
+        self._seat(i)
+        plan = self._plans[i]
+        assert plan is not None
+        scenario = load_scenario(self.grid.id, plan.scenario_id)
+        return scenario.start_datetime + (plan.start + int(self.state.step[i])) * STEP
 
     def what_if(self, i: int, actions: Sequence[int] | None) -> ActionOutcomes:
         """What each action would do in the next step; see :meth:`PowerGridEnv.what_if`."""
