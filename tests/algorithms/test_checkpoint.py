@@ -54,6 +54,8 @@ def test_no_code_is_executed_by_loading(tmp_path: Path):
 def test_what_could_not_be_loaded_is_not_saved(tmp_path: Path):
     with pytest.raises(TypeError, match="Path"):
         save_checkpoint(tmp_path / "c.pt", {"task": tmp_path})
+    with pytest.raises(TypeError, match="bytes"):
+        save_checkpoint(tmp_path / "c.pt", {"task": b"ohm"})
     assert not (tmp_path / "c.pt").exists()
 
 

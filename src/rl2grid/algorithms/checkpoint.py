@@ -26,7 +26,7 @@ FORMAT = 1
 """Raised whenever the sections change; files of another format are refused."""
 
 _ARRAY = "__numpy__"
-_SCALARS = (type(None), bool, int, float, str, bytes)
+_SCALARS = (type(None), bool, int, float, str)
 
 
 def save_checkpoint(path: Path, contents: Mapping[str, Any]) -> None:
