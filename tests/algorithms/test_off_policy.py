@@ -417,7 +417,7 @@ def test_environments_that_cannot_be_learned_are_refused(kind: str):
         trainer(kind, ToyGrid(3, continuous=continuous))
     other = ToyGrid(4, continuous=continuous)
     other.single_action_space = gymnasium.spaces.MultiDiscrete([2, 2])
-    with pytest.raises(UsageError, match="does not play MultiDiscrete"):
+    with pytest.raises(UsageError, match="not MultiDiscrete"):
         trainer(kind, other)
     late = ToyGrid(4, continuous=continuous)
     late.metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP}
@@ -441,7 +441,7 @@ def test_impossible_pairs_are_refused_early():
 def test_a_gpu_is_taken_if_there_is_one_and_refused_if_not(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert trainer("dqn", device="auto").device.type == "cpu"
-    with pytest.raises(UsageError, match="sees no CUDA device"):
+    with pytest.raises(UsageError, match="finds no CUDA device"):
         trainer("dqn", device="cuda")
 
 

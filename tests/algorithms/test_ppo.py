@@ -24,7 +24,6 @@ from rl2grid.algorithms.ppo import (
     Args,
     Minibatch,
     Rollout,
-    explained_variance,
     generalized_advantages,
     load_policy,
     losses,
@@ -471,14 +470,6 @@ def test_good_actions_become_more_probable_and_clipped_ones_are_left_alone():
     gradient = network.log_probabilities.grad
     assert gradient is not None
     assert gradient.tolist() == pytest.approx([0.0, 0.0, -3.3 / 4, 1.5 / 4])
-
-
-def test_explained_variance():
-    returns = torch.tensor([1.0, 2.0, 3.0, 4.0])
-    assert explained_variance(returns, returns) == 1.0
-    assert explained_variance(torch.full((4,), 2.5), returns) == 0.0
-    assert explained_variance(-returns, returns) == pytest.approx(-3.0)
-    assert math.isnan(explained_variance(returns, torch.ones(4)))
 
 
 # --- Training -------------------------------------------------------------------------------------------------------

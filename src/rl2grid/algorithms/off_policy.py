@@ -44,19 +44,18 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
-from gymnasium.spaces import Box, Discrete
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.spaces import Box
+from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from rl2grid.algorithms.playing import Tally, of_transition, reported, resume_environments
+from rl2grid.algorithms.devices import DEVICES, find_device
+from rl2grid.algorithms.playing import Tally, check_environments, of_transition, reported, resume_environments
 from rl2grid.algorithms.replay import ReplayMemory, Step, computer_memory
 from rl2grid.envs.normalization import ObservationNormalizer
 from rl2grid.errors import UsageError, one_of
 
 # --- Hyperparameters ------------------------------------------------------------------------------------------------
-
-DEVICES = ("auto", "cpu", "cuda")
 
 
 @dataclass(frozen=True)
@@ -253,7 +252,9 @@ class OffPolicyTrainer(ABC):
         self.args = args
         self.device = find_device(args.device)
         torch.use_deterministic_algorithms(self.device.type == "cpu")
-        self.continuous = _check_environments(args, envs)
+        self.continuous = check_environments(
+            args.algorithm, envs, num_envs=args.num_envs, mask_actions=args.mask_actions
+        )
         self.envs = envs
         self.generator = torch.Generator().manual_seed(args.seed)
         observation_shape, action_space = envs.single_observation_space.shape, envs.single_action_space
@@ -493,36 +494,3 @@ class _History:
     def means(self) -> dict[str, float]:
         """Means over the updates that had the metric; nothing if there were none."""
         return {name: float(torch.stack(values).to(torch.float64).mean()) for name, values in self._values.items()}
-
-
-def find_device(name: str) -> torch.device:
-    """The device that ``name`` asks for.
-
-    Raises:
-        UsageError: a GPU is asked for and PyTorch sees none.
-    """
-    available = torch.cuda.is_available()
-    if name == "cuda" and not available:
-        raise UsageError("PyTorch sees no CUDA device: choose device cpu, or auto.")
-    return torch.device("cuda" if available and name != "cpu" else "cpu")
-
-
-def _check_environments(args: OffPolicyArgs, envs: VectorEnv[Any, Any, Any]) -> bool:
-    """Whether actions are continuous, once it is clear that the environments can be learned."""
-    name = args.algorithm
-    if envs.num_envs != args.num_envs:
-        raise UsageError(f"{name} was to play {args.num_envs} environments, but was given {envs.num_envs}.")
-    if envs.metadata.get("autoreset_mode") != AutoresetMode.SAME_STEP:
-        raise UsageError(f"{name} needs a vector environment with SAME_STEP autoreset.")
-    space = envs.single_action_space
-    if isinstance(space, Discrete):
-        if args.mask_actions and not hasattr(envs, "action_masks"):
-            raise UsageError("The environment offers no action_masks(): set mask_actions to False.")
-        return False
-    if not isinstance(space, Box):
-        raise UsageError(f"{name} does not play {type(space).__name__} actions.")
-    if args.mask_actions:
-        raise UsageError("Only discrete actions can be masked: set mask_actions to False for this task.")
-    if not (np.all(space.low == -1.0) and np.all(space.high == 1.0)):
-        raise UsageError(f"{name} plays continuous actions in Box(-1, 1), which this environment does not have.")
-    return True

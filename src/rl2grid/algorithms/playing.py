@@ -1,5 +1,5 @@
-"""What every algorithm reads of its environments: what they report of a transition, metrics of what was played, and
-their way back to a checkpoint.
+"""What every algorithm asks of its environments: that they can be learned, what they report of a transition, metrics of
+what was played, and their way back to a checkpoint.
 """
 
 from __future__ import annotations
@@ -9,10 +9,41 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from gymnasium.vector import VectorEnv
+from gymnasium.spaces import Box, Discrete
+from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
 from rl2grid.errors import UsageError
+
+
+def check_environments(algorithm: str, envs: VectorEnv[Any, Any, Any], *, num_envs: int, mask_actions: bool) -> bool:
+    """Whether actions are continuous, once it is clear that the environments can be learned.
+
+    Args:
+        algorithm: What messages call the algorithm.
+        envs: The environments.
+        num_envs: How many there must be.
+        mask_actions: Whether the algorithm excludes illegal actions.
+
+    Raises:
+        UsageError: they cannot be learned like this.
+    """
+    if envs.num_envs != num_envs:
+        raise UsageError(f"{algorithm} was to play {num_envs} environments, but was given {envs.num_envs}.")
+    if envs.metadata.get("autoreset_mode") != AutoresetMode.SAME_STEP:
+        raise UsageError(f"{algorithm} needs a vector environment with SAME_STEP autoreset.")
+    space = envs.single_action_space
+    if isinstance(space, Discrete):
+        if mask_actions and not hasattr(envs, "action_masks"):
+            raise UsageError("The environment offers no action_masks(): set mask_actions to False.")
+        return False
+    if not isinstance(space, Box):
+        raise UsageError(f"{algorithm} plays Discrete and Box actions, not {type(space).__name__}.")
+    if mask_actions:
+        raise UsageError("Only discrete actions can be masked: set mask_actions to False for this task.")
+    if not (np.all(space.low == -1.0) and np.all(space.high == 1.0)):
+        raise UsageError(f"{algorithm} plays continuous actions in Box(-1, 1), which this environment does not have.")
+    return True
 
 
 def reported(infos: Mapping[str, Any], key: str, missing: NDArray[Any]) -> NDArray[Any]:

@@ -38,26 +38,25 @@ from __future__ import annotations
 
 import itertools
 import math
-import os
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from gymnasium.spaces import Box, Discrete
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.spaces import Box
+from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from rl2grid.algorithms.playing import Tally, of_transition, reported, resume_environments
+from rl2grid.algorithms.devices import DEVICES, find_device
+from rl2grid.algorithms.diagnostics import explained_variance, mean
+from rl2grid.algorithms.playing import Tally, check_environments, of_transition, reported, resume_environments
 from rl2grid.envs.normalization import NormalizeObservation
 from rl2grid.errors import UsageError, one_of
 
 # --- Hyperparameters ------------------------------------------------------------------------------------------------
-
-DEVICES = ("auto", "cpu", "cuda")
 
 
 @dataclass(frozen=True)
@@ -463,8 +462,8 @@ class PPO:
         torch.set_num_threads(args.torch_threads)
         torch.use_deterministic_algorithms(True)
         self.args = args
-        self.device = _find_device(args.device)
-        self.continuous = _check_environments(args, envs)
+        self.device = find_device(args.device)
+        self.continuous = check_environments("PPO", envs, num_envs=args.num_envs, mask_actions=args.mask_actions)
         self.envs = NormalizeObservation(envs) if args.normalize_observations else envs
         self.generator = torch.Generator().manual_seed(args.seed)
         observation_shape, action_space = envs.single_observation_space.shape, envs.single_action_space
@@ -592,14 +591,14 @@ class PPO:
                 if len(chosen):
                     history.append(self._descend(data.rows(chosen)))
             epochs += 1
-            if args.target_kl is not None and _mean(loss.approximate_kl for loss in history[first:]) > args.target_kl:
+            if args.target_kl is not None and mean(loss.approximate_kl for loss in history[first:]) > args.target_kl:
                 break
         metrics = {
-            "losses/policy_loss": _mean(loss.policy for loss in history),
-            "losses/value_loss": _mean(loss.value for loss in history),
-            "losses/entropy": _mean(loss.entropy for loss in history),
-            "losses/approx_kl": _mean(loss.approximate_kl for loss in history),
-            "losses/clipfrac": _mean(loss.clip_fraction for loss in history),
+            "losses/policy_loss": mean(loss.policy for loss in history),
+            "losses/value_loss": mean(loss.value for loss in history),
+            "losses/entropy": mean(loss.entropy for loss in history),
+            "losses/approx_kl": mean(loss.approximate_kl for loss in history),
+            "losses/clipfrac": mean(loss.clip_fraction for loss in history),
             "losses/explained_variance": explained_variance(rollout.values, returns),
             "charts/learning_rate": learning_rates[0],
             "charts/update_epochs": float(epochs),
@@ -688,48 +687,3 @@ class PPO:
             nn.utils.clip_grad_norm_(parameters, self.args.max_grad_norm)
         self.optimizer.step()
         return loss._replace(total=loss.total.detach())
-
-
-def explained_variance(values: Tensor, returns: Tensor) -> float:
-    """1 - Var(returns - values) / Var(returns): 1 is a perfect critic, 0 one no better than a constant."""
-    variance = returns.var(correction=0)
-    if variance == 0:
-        return math.nan
-    return float(1.0 - (returns - values).var(correction=0) / variance)
-
-
-def _find_device(name: str) -> torch.device:
-    """The device called ``name``, set up so that it computes the same every time."""
-    if name == "auto":
-        name = "cuda" if torch.cuda.is_available() else "cpu"
-    if name == "cuda":
-        if not torch.cuda.is_available():
-            raise UsageError("PyTorch finds no CUDA device here: set device to cpu or auto.")
-        # Without it, cuBLAS is refused by use_deterministic_algorithms.
-        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
-    return torch.device(name)
-
-
-def _check_environments(args: Args, envs: VectorEnv[Any, Any, Any]) -> bool:
-    """Whether actions are continuous, once it is clear that PPO can be trained here."""
-    if envs.num_envs != args.num_envs:
-        raise UsageError(f"PPO was to play {args.num_envs} environments, but was given {envs.num_envs}.")
-    if envs.metadata.get("autoreset_mode") != AutoresetMode.SAME_STEP:
-        raise UsageError("PPO needs a vector environment with SAME_STEP autoreset.")
-    space = envs.single_action_space
-    if isinstance(space, Discrete):
-        if args.mask_actions and not hasattr(envs, "action_masks"):
-            raise UsageError("The environment offers no action_masks(): set mask_actions to False.")
-        return False
-    if not isinstance(space, Box):
-        raise UsageError(f"PPO plays Discrete and Box actions, not {type(space).__name__}.")
-    if args.mask_actions:
-        raise UsageError("Only discrete actions can be masked: set mask_actions to False for this task.")
-    if not (np.all(space.low == -1.0) and np.all(space.high == 1.0)):
-        raise UsageError("PPO plays continuous actions in Box(-1, 1), which this environment does not have.")
-    return True
-
-
-def _mean(scalars: Iterable[Tensor]) -> float:
-    values = [float(scalar) for scalar in scalars]
-    return float(np.mean(values)) if values else math.nan
