@@ -20,6 +20,7 @@ from rl2grid.algorithms import dqn, sac, td3
 from rl2grid.algorithms.checkpoint import load_checkpoint, save_checkpoint
 from rl2grid.algorithms.off_policy import OffPolicyTrainer, follow, make_network, random_legal_actions
 from rl2grid.algorithms.policy_agent import PolicyAgent, load_agent
+from rl2grid.algorithms.replay import ReplayMemory
 from rl2grid.errors import UsageError
 
 SIZES: dict[str, Any] = {
@@ -470,6 +471,25 @@ def test_the_papers_grid_search_holds_the_papers_values(module: Any):
         assert getattr(args, name) in values, name
     memory_bytes = 1700 * 4 * args.buffer_size
     assert memory_bytes < args.buffer_bytes
+
+
+@pytest.mark.parametrize("kind", MADE)
+def test_a_default_memory_on_the_largest_grid_takes_4_gb(kind: str):
+    """A million transitions of its 2,125 features would take 8.6 GB, and twice that with both observations of each."""
+    module, continuous = {"dqn": dqn, "td3": td3}.get(kind, sac), MADE[kind][2]
+    args = module.preset("default", continuous=continuous)
+    memory = ReplayMemory(
+        num_envs=args.num_envs,
+        observation_size=2125,
+        action_dimensions=69 if continuous else None,
+        masked_actions=50 if args.mask_actions else None,
+        max_transitions=args.buffer_size,
+        max_bytes=args.buffer_bytes,
+        memory_bytes=0,
+        seed=0,
+    )
+    assert memory.capacity * memory.record.itemsize <= 4 * 1024**3
+    assert memory.capacity > 400_000
 
 
 def test_unknown_presets_are_refused_and_presets_can_be_changed():

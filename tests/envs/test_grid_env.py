@@ -171,6 +171,43 @@ def test_game_over_terminates_and_completion_truncates(plain):
     assert info["survival"] == 0.0
 
 
+def test_a_completed_month_is_no_game_over(plain):
+    """Survived to the end: truncated, not terminated, and without the cost of a game over."""
+    plain.reset(seed=0, options={"scenario": month(), "start": 8058})
+    for _ in range(6):
+        _, reward, terminated, truncated, info = plain.step(0)
+        assert not terminated
+        assert reward > 0.0
+    assert truncated
+    assert (info["step"], info["survival"], info["game_over"]) == (6, 1.0, 0)
+    assert info["costs"]["LSI"] == 0.0
+
+
+def test_episodes_in_a_row_play_every_scenario(plain):
+    """Each with its own series: a copy that is kept must not stand for the others."""
+    scenarios = list_scenarios("bus14", "bundled")
+    demand = plain.observation_slices["load_p"]
+    plain.reset(seed=0)
+    played = [plain.reset() for _ in scenarios]
+    assert {info["scenario"] for _, info in played} == set(scenarios)
+    assert len({observation[demand].tobytes() for observation, _ in played}) == len(scenarios)
+
+
+def test_scenarios_of_both_mixes_pay(engine):
+    """Grid2Op has two environments for bus118-M; one task plays the series of both, and rewards both."""
+    scenarios = list_scenarios("bus118-M", "bundled")
+    assert {name.split("/")[1] for name in scenarios} == {"x1", "x2.5"}
+    with make("bus118-M-T0", engine=engine, split="bundled") as environment:
+        for scenario in scenarios:
+            environment.reset(seed=0, options={"scenario": scenario})
+            _, reward, terminated, _, info = environment.step(0)
+            assert not terminated
+            # 1 for the step, less at most half of what losses cost.
+            assert 0.5 < reward <= 1.0, scenario
+            assert info["reward_components"]["survive"] == 1.0
+            assert info["reward_components"]["cost"] < 0.0
+
+
 def test_simulate_returns_what_a_step_would_and_changes_nothing(plain):
     plain.reset(seed=0)
     before = plain._observation()

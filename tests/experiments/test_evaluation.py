@@ -29,6 +29,7 @@ from rl2grid.experiments.episode import environment_seed, play_episode
 from rl2grid.experiments.evaluation import PARTIAL_FILE, evaluate, run_evaluation, validator
 from rl2grid.experiments.players import Job, Setting
 from rl2grid.experiments.runs import hyperparameters
+from rl2grid.grids import GRID_IDS
 from rl2grid.scenarios.generated import VERSION
 from rl2grid.scenarios.library import list_scenarios
 
@@ -259,6 +260,18 @@ def test_bad_requests_are_refused_in_one_sentence(tmp_path):
 def test_recovery_refuses_tasks_without_topology():
     with pytest.raises(UsageError, match="cannot play a redispatching task"):
         evaluate("recovery", "bus14-R")
+
+
+@pytest.mark.parametrize("grid_id", GRID_IDS)
+def test_every_grid_can_be_evaluated(grid_id):
+    scenario = list_scenarios(grid_id, "bundled")[0]
+    for kind in ("T0", "R"):
+        result = evaluate(
+            "random", f"{grid_id}-{kind}", split="bundled", scenarios=(f"{scenario}[0:5]",), seeds=(0,), workers=0
+        )
+        (episode,) = result.episodes
+        assert 1 <= episode.grid_steps <= 4
+        assert episode.episode_return <= episode.grid_steps
 
 
 @pytest.mark.parametrize("engine", ENGINES)
