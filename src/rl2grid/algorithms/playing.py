@@ -62,6 +62,26 @@ def of_transition(infos: Mapping[str, Any], key: str, ended: NDArray[np.bool_], 
     return np.where(ended, last, reported(infos, key, missing))
 
 
+_OF_EPISODES: dict[str, tuple[str, ...]] = {
+    "charts/survival": ("survival",),
+    "charts/score_margin": ("scores", "margin"),
+    "charts/score_overload": ("scores", "overload"),
+    "charts/score_topology": ("scores", "topology"),
+    "charts/cost_lsi": ("episode_costs", "LSI"),
+    "charts/cost_tlo": ("episode_costs", "TLO"),
+}
+"""Metrics of an episode that ended, and where its last ``info`` tells them."""
+
+
+def _entry(info: Mapping[str, Any], path: tuple[str, ...]) -> Any:
+    """What ``info`` holds under nested keys; None where an environment does not report it."""
+    for key in path:
+        if key not in info:
+            return None
+        info = info[key]
+    return info
+
+
 class Tally:
     """What happened during an iteration, for the metrics."""
 
@@ -92,9 +112,11 @@ class Tally:
             return
         self._episodes.setdefault("charts/episodic_return", []).extend(episode_returns[ended].tolist())
         self._episodes.setdefault("charts/episodic_length", []).extend(episode_lengths[ended].tolist())
-        survival = infos.get("final_info", {}).get("survival")
-        if survival is not None:
-            self._episodes.setdefault("charts/survival", []).extend(np.asarray(survival)[ended].tolist())
+        final = infos.get("final_info", {})
+        for metric, path in _OF_EPISODES.items():
+            values = _entry(final, path)
+            if values is not None:
+                self._episodes.setdefault(metric, []).extend(np.asarray(values)[ended].tolist())
 
     def metrics(self) -> dict[str, float]:
         """Means over decisions and over the episodes that ended (none of the latter if none did)."""
