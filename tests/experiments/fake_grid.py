@@ -46,6 +46,10 @@ class FakeGrid(gymnasium.Env[Any, Any]):
         self.options = SimpleNamespace(heuristic=heuristic)
         self._log, self._fail_on, self._exit_on, self._delay = log, fail_on, exit_on, delay
 
+    @property
+    def state(self) -> SimpleNamespace:
+        return self._state
+
     def action_masks(self) -> np.ndarray[Any, Any]:
         return np.array([True, True, self._stress < 0.3, False])
 
@@ -74,6 +78,14 @@ class FakeGrid(gymnasium.Env[Any, Any]):
             step=np.zeros(1, np.int32),
             episode_length=np.full(1, LENGTH, np.int32),
             terminated=np.zeros(1, np.bool_),
+            final_topo_vect=np.ones((1, 2 + 2 * N_LINES), np.int32),
+            line_or_pos_topo_vect=np.arange(1, 1 + N_LINES),
+            line_ex_pos_topo_vect=np.arange(2 + N_LINES, 2 + 2 * N_LINES),
+            gen_pos_topo_vect=np.array([0]),
+            load_pos_topo_vect=np.array([1 + N_LINES]),
+            element_to_subid=np.repeat([0, 1], 1 + N_LINES),
+            sub_info=np.full(2, 1 + N_LINES),
+            slack_gen=np.array([0]),
         )
         self._steps = 0
         self._announce()

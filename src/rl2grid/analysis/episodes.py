@@ -40,6 +40,13 @@ class Episode:
     """Whether the last step was reached without a game over."""
     game_over: str
     """Name of the :class:`~rl2grid.mdp.termination.GameOver` reason; ``NONE`` when completed."""
+    last_overloads: str
+    """Lines above their limit in the state before the game over: ids in order, separated by spaces. Empty where
+    there were none, as when a sound grid is attacked, and when the episode was completed; so are the next two."""
+    last_outages: str
+    """Lines out of service when the grid collapsed, by protection, attack, maintenance or choice."""
+    last_cut_off: str
+    """Substations where a load or generator was off, or something was not connected to the balancing generator."""
     episode_return: float
     """Sum of the rewards of all grid steps."""
     return_survive: float

@@ -11,6 +11,7 @@ from typing import Any
 import gymnasium
 
 from rl2grid.agents.agent import Action, Agent, Info, RandomizedAgent, no_intervention
+from rl2grid.experiments.collapse import COMPLETED, collapse, overloaded_lines
 from rl2grid.mdp.termination import GameOver
 
 OnDecision = Callable[[Action, Info], None]
@@ -30,6 +31,9 @@ class PlayedEpisode:
     survival: float
     completed: bool
     game_over: str
+    last_overloads: str
+    last_outages: str
+    last_cut_off: str
     episode_return: float
     return_survive: float
     return_overload: float
@@ -79,7 +83,11 @@ def play_episode(
     totals: dict[str, float] = dict.fromkeys(_TOTALS, 0.0)
     decisions = illegal = ambiguous = 0
     over = False
+    state = env.unwrapped.state  # type: ignore[attr-defined]
     while not over:
+        # The agent is only asked where the heuristic is not at ease, so that a game over in a later step of the
+        # transition, or inside the reset, comes from a state without overloads.
+        decided, overloads = info["step"], overloaded_lines(state, 0)
         if info["over"]:
             action = no_intervention(env.action_space)
         else:
@@ -92,6 +100,7 @@ def play_episode(
         _add(totals, float(reward), info)
         illegal += int(info["illegal"])
         ambiguous += int(info["ambiguous"])
+    ending = collapse(state, 0, overloads if info["step"] == decided + 1 else "") if terminated else COMPLETED
     return PlayedEpisode(
         scenario=scenario,
         seed=seed,
@@ -108,6 +117,7 @@ def play_episode(
         illegal=illegal,
         ambiguous=ambiguous,
         wall_time_s=round(time.perf_counter() - began, 4),
+        **ending._asdict(),
         **totals,
     )
 
