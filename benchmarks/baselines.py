@@ -15,12 +15,11 @@ import json
 import os
 import shlex
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
 from rl2grid.algorithms.policy_agent import load_agent
-from rl2grid.analysis.episodes import format_row
 from rl2grid.analysis.results import EvaluationResult, identity_hash
 from rl2grid.analysis.statistics import Estimate
 from rl2grid.envs.tasks import find_task
@@ -147,9 +146,9 @@ def test(chosen: Subject) -> dict[str, Any]:
     }
 
 
-def _rows(result: EvaluationResult) -> list[str]:
-    """The episodes without the time that they took."""
-    return [format_row(replace(episode, wall_time_s=0.0)) for episode in result.episodes]
+def _rows(result: EvaluationResult) -> list[list[Any]]:
+    """What must be equal wherever the episodes are played."""
+    return [[row.scenario, row.seed, row.grid_steps, row.decisions, row.episode_return] for row in result.episodes]
 
 
 def _figures(result: EvaluationResult) -> dict[str, Any]:

@@ -18,7 +18,7 @@ import platformdirs
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-INTERPRETED_LAYERS = ("agents", "algorithms", "analysis", "cli", "envs", "experiments")
+INTERPRETED_LAYERS = ("agents", "algorithms", "analysis", "cli", "drawing", "envs", "experiments")
 """Subpackages without compiled functions: an edit of them leaves the compiled ones what they are."""
 
 
