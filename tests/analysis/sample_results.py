@@ -89,6 +89,7 @@ def recording(n_steps: int = 700, n_line: int = 6, game_over: str = "the grid fe
         "may",
         0,
         0,
+        "2020-05-01T00:00:00",
         2 * n_steps if game_over else n_steps,
         game_over,
         tuple(f"line {k}" for k in range(n_line)),
@@ -98,4 +99,6 @@ def recording(n_steps: int = 700, n_line: int = 6, game_over: str = "the grid fe
         status,
         attacked,
         np.zeros_like(status),
+        np.ones((n_steps + 1, 2 * n_line), np.int8),
+        *(np.zeros((n_steps + 1, n), np.float32) for n in (2, 3, 1)),
     )

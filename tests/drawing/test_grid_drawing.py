@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from rl2grid.drawing.grid_drawing import (
     FrameRenderer,
     GridDrawing,
-    _geometry,
+    geometry_of,
     loading_colours,
     reference_scene,
 )
@@ -43,7 +43,7 @@ def scene_with(grid, **changes):
 @pytest.mark.parametrize("grid_id", GRID_IDS)
 def test_symbols_cover_neither_each_other_nor_another_substation(grid_id):
     grid = load_grid(grid_id)
-    geometry = _geometry(grid)
+    geometry = geometry_of(grid)
     own = grid.element_to_subid[geometry.symbol_element]
     to_substations = np.linalg.norm(geometry.symbol[:, None] - geometry.centre, axis=2)
     np.testing.assert_allclose(to_substations[np.arange(len(own)), own], 0.6 * geometry.unit)
@@ -57,12 +57,12 @@ def test_symbols_cover_neither_each_other_nor_another_substation(grid_id):
 
 def test_parallel_lines_are_drawn_apart():
     grid = load_grid("bus36-M")
-    middles = _geometry(grid).line_middle.mean(axis=1)
+    middles = geometry_of(grid).line_middle.mean(axis=1)
     between = np.linalg.norm(middles[:, None] - middles, axis=2)
     np.fill_diagonal(between, np.inf)
     pairs = {tuple(sorted(pair)) for pair in zip(grid.line_or_to_subid, grid.line_ex_to_subid, strict=True)}
     assert len(pairs) < grid.n_line
-    assert between.min() > 0.1 * _geometry(grid).unit
+    assert between.min() > 0.1 * geometry_of(grid).unit
 
 
 def test_a_split_substation_has_two_bars_and_elements_end_on_theirs(drawing):
@@ -107,7 +107,7 @@ def test_only_what_is_highlighted_gets_a_marker(drawing):
     drawing.show(scene_with(BUS14, highlighted=([load, line], True)))
     assert len(drawing._halo.get_segments()) == 2
     (disc,) = drawing._halo_discs.get_paths()
-    symbol = _geometry(BUS14).symbol[_geometry(BUS14).symbol_element == load][0]
+    symbol = geometry_of(BUS14).symbol[geometry_of(BUS14).symbol_element == load][0]
     np.testing.assert_allclose(disc.vertices[:-1].mean(axis=0), symbol, atol=1e-6)
     drawing.show(reference_scene(BUS14))
     assert not drawing._halo.get_segments()

@@ -35,7 +35,7 @@ def test_a_picture_shows_the_state_and_the_last_action(rendered):
     rendered.step(0)
     assert (rendered.render() != first).any()
     base = rendered.unwrapped
-    caption = caption_of(base.grid, base.state, 0, base.clock, base.describe_action(0))
+    caption = caption_of(base.grid, base.state, 0, base.clock_at(1), base.describe_action(0))
     assert f"worst loading {base.state.rho.max():.0%}" in caption.headline
     assert f"survived 1 of {base.state.episode_length[0]:,} steps" in caption.headline
     assert caption.sentence == "last action: do nothing"
@@ -52,7 +52,7 @@ def test_a_game_over_is_drawn_with_its_topology_and_told(rendered):
     assert (scene.topo_vect == base.state.final_topo_vect[0]).all()
     assert (scene.topo_vect > 0).any()
     assert np.isnan(scene.rho).all()
-    caption = caption_of(base.grid, base.state, 0, base.clock, "")
+    caption = caption_of(base.grid, base.state, 0, base.clock_at(1), "")
     assert f"game over after {info['step'] - 1}" in caption.headline
     assert caption.sentence.startswith(info["game_over_text"].split(": ")[1])
     assert rendered.render().shape == (720, 1280, 3)
@@ -73,7 +73,7 @@ def test_a_video_can_be_recorded(tmp_path):
     from gymnasium.wrappers import RecordVideo
 
     environment = RecordVideo(
-        make(render_mode="rgb_array"), str(tmp_path), video_length=3, episode_trigger=lambda _: True
+        make(render_mode="rgb_array"), str(tmp_path / "videos"), episode_trigger=lambda _: True, video_length=3
     )
     environment.reset(seed=0)
     for _ in range(4):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 import zlib
+from datetime import datetime, timedelta
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -53,6 +54,9 @@ class FakeGrid(gymnasium.Env[Any, Any]):
     def action_masks(self) -> np.ndarray[Any, Any]:
         return np.array([True, True, self._stress < 0.3, False])
 
+    def clock_at(self, step: int) -> datetime:
+        return datetime(2020, 4, 1) + step * timedelta(minutes=5)
+
     def describe_action(self, action: Any) -> str:
         return f"action {int(action)}"
 
@@ -75,6 +79,10 @@ class FakeGrid(gymnasium.Env[Any, Any]):
             line_status=np.ones((1, N_LINES), np.bool_),
             attacked=np.zeros((1, N_LINES), np.bool_),
             time_next_maintenance=np.full((1, N_LINES), -1, np.int32),
+            topo_vect=np.ones((1, 2 * N_LINES), np.int32),
+            gen_p=np.zeros((1, 1), np.float32),
+            load_p=np.zeros((1, 1), np.float32),
+            storage_power=np.zeros((1, 0), np.float32),
             step=np.zeros(1, np.int32),
             episode_length=np.full(1, LENGTH, np.int32),
             terminated=np.zeros(1, np.bool_),

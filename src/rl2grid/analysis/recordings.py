@@ -27,6 +27,8 @@ class Recording:
     scenario: str
     seed: int
     start: int
+    began: str
+    """Time of row 0 in the scenario, ISO 8601."""
     episode_length: int
     """Steps of a completed episode."""
     game_over: str
@@ -44,6 +46,14 @@ class Recording:
     """[step, line] out by the opponent."""
     maintained: NDArray[np.bool_]
     """[step, line] out for planned maintenance."""
+    topo_vect: NDArray[np.int8]
+    """[step, topo] busbar of each element, -1 when disconnected."""
+    gen_p: NDArray[np.float32]
+    """[step, gen] MW."""
+    load_p: NDArray[np.float32]
+    """[step, load] MW."""
+    storage_power: NDArray[np.float32]
+    """[step, storage] MW, positive charges."""
 
     @property
     def n_steps(self) -> int:
@@ -51,7 +61,7 @@ class Recording:
         return len(self.rho) - 1
 
 
-_ARRAYS = ("rho", "line_status", "attacked", "maintained")
+_ARRAYS = ("rho", "line_status", "attacked", "maintained", "topo_vect", "gen_p", "load_p", "storage_power")
 _WORDS = "description"
 
 

@@ -112,19 +112,23 @@ def reference_scene(grid: Grid) -> Scene:
     )
 
 
+def largest_power(grid: Grid) -> float:
+    """The power, in MW, that has the largest symbol."""
+    return max(float(grid.gen_pmax.max()), float(grid.load_p_max.max()))
+
+
 def symbol_scale(grid: Grid, power: NDArray[np.float32]) -> Points:
     """How large symbols are for a power in MW: their area grows with it, and the smallest is still seen.
 
     Returns:
         Factors of the usual size, the shape of ``power``; 1 where the power is NaN.
     """
-    largest = max(float(grid.gen_pmax.max()), float(grid.load_p_max.max()))
-    share = np.minimum(1.0, np.abs(power) / largest)
+    share = np.minimum(1.0, np.abs(power) / largest_power(grid))
     return np.where(np.isnan(power), 1.0, SMALLEST_SYMBOL + (LARGEST_SYMBOL - SMALLEST_SYMBOL) * np.sqrt(share))
 
 
 @dataclass(frozen=True, eq=False)
-class _Geometry:
+class Geometry:
     """Where things are; lengths in the units of ``Grid.layout``."""
 
     unit: float
@@ -141,7 +145,12 @@ class _Geometry:
 
 
 @functools.cache
-def _geometry(grid: Grid) -> _Geometry:
+def geometry_of(grid: Grid) -> Geometry:
+    """Where the substations, lines and symbols of a grid are drawn.
+
+    Raises:
+        UsageError: the grid has no layout.
+    """
     centre = np.array(grid.layout, np.float64)
     distance = np.linalg.norm(centre[:, None] - centre[None], axis=2)
     np.fill_diagonal(distance, np.inf)
@@ -155,7 +164,7 @@ def _geometry(grid: Grid) -> _Geometry:
     goal[grid.line_or_pos_topo_vect] = line_middle[:, 0]
     goal[grid.line_ex_pos_topo_vect] = line_middle[:, 1]
     goal[element] = symbol
-    return _Geometry(unit, centre, symbol, element, line_middle, _unit_vectors(goal - centre[grid.element_to_subid]))
+    return Geometry(unit, centre, symbol, element, line_middle, _unit_vectors(goal - centre[grid.element_to_subid]))
 
 
 def _unit_vectors(vectors: Points) -> Points:
@@ -230,7 +239,7 @@ class GridDrawing:
         substations: Sequence[int] | None = None,
         border: float = 0.85,
     ) -> None:
-        self._grid, self._theme, self._geometry = grid, theme, _geometry(grid)
+        self._grid, self._theme, self._geometry = grid, theme, geometry_of(grid)
         self.unit = self._geometry.unit
         """The length that sizes are measured in, of ``Grid.layout``."""
         self._colours = loading_colours(theme)
@@ -464,7 +473,7 @@ _WAVE = np.stack((0.6 * _PHASE / np.pi, 0.38 * np.sin(_PHASE)), axis=1)
 _PLATES = 0.5 * np.array([[[-1.0, 0.35], [1.0, 0.35]], [[-0.5, -0.35], [0.5, -0.35]]])
 
 
-def _frame_axes(axes: Axes, geometry: _Geometry, substations: Sequence[int] | None, border: float) -> float:
+def _frame_axes(axes: Axes, geometry: Geometry, substations: Sequence[int] | None, border: float) -> float:
     """Set what is in view; returns the length of a unit in points."""
     shown = np.asarray(range(len(geometry.centre)) if substations is None else substations)
     subs = geometry.centre[shown]

@@ -216,14 +216,13 @@ class PowerGridEnv(gymnasium.Env[NDArray[np.float32], Any], TaskDescription):
         self._player.write_action_mask(0, mask)
         return mask
 
-    @property
-    def clock(self) -> datetime:
-        """The time in the scenario of what :attr:`state` shows.
+    def clock_at(self, step: int) -> datetime:
+        """The time in the scenario after ``step`` steps of the episode.
 
         Raises:
             UsageError: the environment was not reset yet.
         """
-        return self._player.clock(0)
+        return self._player.clock(0, step)
 
     def render(self) -> NDArray[np.uint8]:  # type: ignore[override]
         """The grid and what the agent did last as a picture, uint8 [720, 1280, 3].
@@ -244,7 +243,8 @@ class PowerGridEnv(gymnasium.Env[NDArray[np.float32], Any], TaskDescription):
         if self._renderer is None:
             self._renderer = grid_drawing.FrameRenderer(self.grid)
         action = "" if self._last_action is None else self.describe_action(self._last_action)
-        caption = episode_frames.caption_of(self.grid, self.state, 0, self.clock, action)
+        clock = self.clock_at(int(self.state.step[0]))
+        caption = episode_frames.caption_of(self.grid, self.state, 0, clock, action)
         return self._renderer.frame(episode_frames.scene_of(self.grid, self.state, 0), caption)
 
     def close(self) -> None:

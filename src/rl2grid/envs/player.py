@@ -183,13 +183,13 @@ class TaskPlayer:
         reward = float(result.transition_reward[0])
         return SimulationResult(observation, reward, info["cost"], bool(result.terminated[0]), info)
 
-    def clock(self, i: int) -> datetime:
-        """The time of what the state of row ``i`` shows."""
+    def clock(self, i: int, step: int) -> datetime:
+        """The time in the scenario after ``step`` steps of the episode of row ``i``."""
         self._seat(i)
         plan = self._plans[i]
         assert plan is not None
         scenario = load_scenario(self.grid.id, plan.scenario_id)
-        return scenario.start_datetime + (plan.start + int(self.state.step[i])) * STEP
+        return scenario.start_datetime + (plan.start + step) * STEP
 
     def what_if(self, i: int, actions: Sequence[int] | None) -> ActionOutcomes:
         """What each action would do in the next step; see :meth:`PowerGridEnv.what_if`."""

@@ -88,7 +88,7 @@ def evaluate(
     """
     task = find_task(task_id)
     chosen = make_agent(agent, task.id) if isinstance(agent, str | Path) else agent
-    keywords = _env_keywords(chosen, {**options, "split": split, "heuristic": heuristic})
+    keywords = env_keywords(chosen, {**options, "split": split, "heuristic": heuristic})
     chosen_scenarios = _checked_scenarios(task, split, scenarios)
     jobs = _jobs(chosen_scenarios, seeds, start)
     return run_evaluation(
@@ -170,7 +170,7 @@ def validator(
     return validate
 
 
-def _env_keywords(agent: Agent, keywords: dict[str, Any]) -> dict[str, Any]:
+def env_keywords(agent: Agent, keywords: dict[str, Any]) -> dict[str, Any]:
     """Keywords of the environments: those given, else what the policy was trained with, else the defaults."""
     trained: Mapping[str, Any] = getattr(agent, "env_keywords", {})
     if keywords["heuristic"] == AS_TRAINED:

@@ -1,0 +1,114 @@
+"""``rl2grid watch``: play one episode, and write it as a page with a time slider and as an animation."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from rl2grid.cli.train import INTERRUPTED
+from rl2grid.engines import HEURISTICS
+from rl2grid.envs.tasks import find_task
+from rl2grid.errors import UsageError
+from rl2grid.scenarios.splits import SPLITS
+
+FRAMES = 300
+"""Frames of an animation unless --every is given: 25 seconds."""
+FORMATS = ("html", "gif", "mp4")
+
+
+def add_parser(commands: Any) -> None:
+    """Add the subcommand to those of ``rl2grid``."""
+    parser = commands.add_parser("watch", help="play one episode and make it visible: a page, an animation")
+    parser.add_argument(
+        "agent", help="do-nothing, random, recovery, greedy, milp, dc-opf, or a run folder or checkpoint"
+    )
+    parser.add_argument("task", help="for example bus14-T0")
+    parser.add_argument("--split", default="validation", choices=SPLITS)
+    parser.add_argument("--scenario", default=None, help="by default the first of the split")
+    parser.add_argument("--seed", type=int, default=0, help="of maintenance, opponent and agent")
+    parser.add_argument("--heuristic", default=None, choices=("None", *HEURISTICS), help="by default the agent's own")
+    parser.add_argument("--steps", type=int, default=None, help="play no more grid steps than these")
+    parser.add_argument(
+        "--every", type=int, default=None, help=f"grid steps between two frames; by default at most {FRAMES} frames"
+    )
+    parser.add_argument("--format", nargs="+", default=["html", "gif"], choices=FORMATS, help="by default html and gif")
+    parser.add_argument("--output", type=Path, default=Path("watched"), help="folder of the files")
+    parser.set_defaults(run=_run)
+
+
+def _run(options: argparse.Namespace) -> int:
+    task = find_task(options.task)
+    if options.every is not None and options.every < 1:
+        raise UsageError(f"every={options.every} is not allowed: give a number of grid steps, at least 1.")
+    animation, watch_page = _drawing_modules()
+    for suffix in options.format:
+        animation.check_encoder(suffix)
+    try:
+        options.output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"Folder {options.output} cannot be made: {error.strerror}.") from None
+    try:
+        with _progress() as progress:
+            recording = _play(options, progress)
+            name = f"{task.id.removeprefix('rl2grid/')}-{recording.agent}-{recording.scenario.replace('/', '-')}"
+            path = options.output / f"{name}-{options.seed}"
+            for suffix in options.format:
+                target = path.with_name(f"{path.name}.{suffix}")
+                if suffix == "html":
+                    watch_page.write_watch_page(target, task.grid, recording)
+                    continue
+                steps = _frame_steps(len(recording.rho), options.every)
+                pictures = animation.frames(task.grid, recording, steps)
+                animation.write_animation(target, progress.track(pictures, len(steps), description=f"Drawing {suffix}"))
+    except KeyboardInterrupt:
+        print("rl2grid: interrupted; no file was left half written.", file=sys.stderr)
+        return INTERRUPTED
+    acted = sum(bool(words) for words in recording.actions)
+    ending = f"game over: {recording.game_over}" if recording.game_over else "alive at the end"
+    print(f"{recording.n_steps:,} of {recording.episode_length:,} steps, {acted:,} actions; {ending}.")
+    for suffix in options.format:
+        print(f"Written: {path}.{suffix}")
+    return 0
+
+
+def _play(options: argparse.Namespace, progress: Progress) -> Any:
+    from rl2grid.experiments.evaluation import AS_TRAINED
+    from rl2grid.experiments.watching import play_to_watch
+
+    task = progress.add_task("Playing", total=None)
+    heuristic = {None: AS_TRAINED, "None": None}.get(options.heuristic, options.heuristic)
+    return play_to_watch(
+        options.agent,
+        options.task,
+        split=options.split,
+        scenario=options.scenario,
+        seed=options.seed,
+        heuristic=heuristic,
+        steps=options.steps,
+        on_step=lambda step, length: progress.update(task, completed=step, total=min(length, options.steps or length)),
+    )
+
+
+def _frame_steps(n_rows: int, every: int | None) -> Sequence[int]:
+    """Steps that are drawn: the last one always."""
+    stride = every or -(-n_rows // FRAMES)
+    steps = list(range(0, n_rows, stride))
+    return steps if steps[-1] == n_rows - 1 else [*steps, n_rows - 1]
+
+
+def _progress() -> Progress:
+    return Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+
+
+def _drawing_modules() -> tuple[ModuleType, ModuleType]:
+    try:
+        from rl2grid.analysis import animation, watch_page
+    except ImportError as error:
+        raise UsageError(f"Watching needs {error.name}: install it with `pip install rl2grid[analysis]`.") from None
+    return animation, watch_page
