@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from rl2grid import __version__
-from rl2grid.cli import actions, data, watch
+from rl2grid.cli import actions, data, study, watch
 from rl2grid.cli.train import INTERRUPTED, train
 from rl2grid.engines import ENGINES, HEURISTICS
 from rl2grid.errors import UsageError
@@ -58,6 +58,7 @@ def _run(command_line: list[str]) -> int:
     actions.add_parser(commands)
     data.add_parser(commands)
     watch.add_parser(commands)
+    study.add_parser(commands)
     if command_line[:1] == ["train"]:
         return train(command_line[1:])
     options = parser.parse_args(command_line)
