@@ -9,13 +9,14 @@ from datetime import datetime
 from pathlib import Path
 
 import numpy as np
+from matplotlib.colors import to_rgba_array
 from numpy.typing import NDArray
 from PIL import Image
 
 from rl2grid.analysis.recordings import Recording
 from rl2grid.drawing.episode_frames import describe_moment
 from rl2grid.drawing.grid_drawing import Caption, FrameRenderer, Scene, loading_colours
-from rl2grid.drawing.theme import LIGHT
+from rl2grid.drawing.theme import GREEN, LIGHT, PURPLE
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
 from rl2grid.scenarios.scenario import STEP
@@ -103,7 +104,8 @@ def _write_gif(path: Path, pictures: Iterator[Frame]) -> None:
 def _palette(picture: Image.Image) -> Image.Image:
     """Colours of a picture and of all loadings, whichever of them the first picture shows."""
     shades = np.rint(255 * loading_colours(LIGHT)(np.linspace(0, 1.01, 160))[:, :3]).astype(np.uint8)
-    marks = np.array([[204, 121, 167], [0, 158, 115], [185, 190, 196]], np.uint8)
+    named = (LIGHT.background, LIGHT.text, LIGHT.muted, LIGHT.out, PURPLE, GREEN)
+    marks = np.rint(255 * to_rgba_array(named)[:, :3]).astype(np.uint8)
     greys = picture.quantize(90).convert("RGB").getcolors(256) or []
     colours = [*marks.tolist(), *[list(colour) for _, colour in greys], *shades.tolist()][:256]
     palette = Image.new("P", (1, 1))

@@ -1,0 +1,35 @@
+"""``rl2grid watch``: what it writes, and how it refuses."""
+
+import pytest
+from PIL import Image
+
+from rl2grid.cli.main import main
+
+
+def test_an_episode_is_written_as_page_and_animation(capsys, tmp_path):
+    command_line = ["watch", "do-nothing", "bus14-T0", "--split", "bundled", "--steps", "6", "--every", "3"]
+    assert main([*command_line, "--output", str(tmp_path)]) == 0
+    output = capsys.readouterr().out
+    assert "6 of " in output
+    (page,), (animation,) = tmp_path.glob("*.html"), tmp_path.glob("*.gif")
+    assert str(page) in output.replace("\n", "")
+    with Image.open(animation) as pictures:
+        assert pictures.n_frames == 3
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (["genius", "bus14-T0"], "choose one of do-nothing"),
+        (["do-nothing", "bus14-T0", "--steps", "0"], "steps=0 is not allowed"),
+        (["do-nothing", "bus14-T0", "--every", "0"], "every=0 is not allowed"),
+        (["do-nothing", "bus14-T0", "--seed", "-1"], "seed=-1 is not allowed"),
+        (["do-nothing", "bus14-T0", "--scenario", "nowhere"], "nowhere"),
+        (["do-nothing", "bus14-T0", "--format", "avi"], "choose from 'html', 'gif', 'mp4'"),
+    ],
+)
+def test_bad_requests_are_refused_with_one_sentence(capsys, tmp_path, flags, words):
+    assert main(["watch", *flags, "--output", str(tmp_path)]) == 2
+    (sentence,) = [line for line in capsys.readouterr().err.strip().splitlines() if line.startswith("rl2grid: ")]
+    assert words in sentence
+    assert not list(tmp_path.iterdir())
