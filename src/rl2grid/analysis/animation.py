@@ -106,8 +106,11 @@ def _palette(picture: Image.Image) -> Image.Image:
     shades = np.rint(255 * loading_colours(LIGHT)(np.linspace(0, 1.01, 160))[:, :3]).astype(np.uint8)
     named = (LIGHT.background, LIGHT.text, LIGHT.muted, LIGHT.out, PURPLE, GREEN)
     marks = np.rint(255 * to_rgba_array(named)[:, :3]).astype(np.uint8)
-    greys = picture.quantize(90).convert("RGB").getcolors(256) or []
-    colours = [*marks.tolist(), *[list(colour) for _, colour in greys], *shades.tolist()][:256]
+    common = picture.quantize(90).convert("RGB").getcolors(256) or []
+    smooth = np.array([colour for _, colour in common], np.int16)
+    # Pillow takes neighbours for one colour: beside the paper's white, an almost white one would be used for it.
+    apart = np.abs(smooth[:, None] - marks.astype(np.int16)).max(axis=2).min(axis=1) > 8
+    colours = [*marks.tolist(), *smooth[apart].tolist(), *shades.tolist()][:256]
     palette = Image.new("P", (1, 1))
     palette.putpalette([value for colour in colours for value in colour])
     return palette

@@ -124,7 +124,12 @@ def share_above(thresholds: ArrayLike) -> Aggregate:
 
 
 def estimate(
-    scores: Scores, aggregate: Aggregate = mean_score, *, resamples: int = RESAMPLES, level: float = LEVEL, seed: int = 0
+    scores: Scores,
+    aggregate: Aggregate = mean_score,
+    *,
+    resamples: int = RESAMPLES,
+    level: float = LEVEL,
+    seed: int = 0,
 ) -> Estimate:
     """An aggregate of scores, with the percentile interval of a bootstrap over :attr:`Scores.unit`."""
     value, low, high = score_band(scores, aggregate, resamples=resamples, level=level, seed=seed)
