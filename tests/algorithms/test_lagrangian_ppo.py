@@ -707,10 +707,10 @@ def test_a_run_stores_its_request_and_goes_on_after_an_interruption(tmp_path: Pa
     def break_off(agent: PolicyAgent) -> dict[str, float]:
         if agent.identity["decisions"] == 4 * 16 * 4:
             raise BrokenOffError
-        return {"survival": 0.0}
+        return {"survival": 0.0, "safe_completed": 0.0}
 
     def finish(agent: PolicyAgent) -> dict[str, float]:
-        return {"survival": 0.0}
+        return {"survival": 0.0, "safe_completed": 0.0}
 
     def make_envs(args: RunArgs) -> Any:
         return CostlyToyGrid(4)

@@ -25,7 +25,7 @@ from rl2grid.algorithms.policy_agent import PolicyAgent, load_agent
 from rl2grid.algorithms.ppo import Args
 from rl2grid.errors import UsageError
 from rl2grid.experiments import runs
-from rl2grid.experiments.runs import RunArgs, hyperparameters, is_finished, read_config, resume, train
+from rl2grid.experiments.runs import RunArgs, find_limits, hyperparameters, is_finished, read_config, resume, train
 
 SMALL = Args(
     seed=5,
@@ -139,6 +139,38 @@ def test_the_best_policy_by_validation_survival_is_kept(tmp_path: Path):
     assert wide["validation/return"].dropna().tolist() == [2.0] * 4
 
 
+def test_the_best_policy_under_a_constraint_is_the_one_most_often_safe(tmp_path: Path):
+    """Then the one that survives longest, then the latest; without the constraint survival alone decides."""
+    safe = {96: 0.5, 192: 0.75, 288: 0.75, 384: 0.75}
+    survival = {96: 1.0, 192: 0.9, 288: 0.95, 384: 0.9}
+
+    def validate(agent: PolicyAgent) -> Mapping[str, float]:
+        decisions = agent.identity["decisions"]
+        return {"survival": survival[decisions], "safe_completed": safe[decisions]}
+
+    for name, changes, best in (
+        ("id", {"task": "bus14-T0-LSI"}, 288),
+        ("keyword", {"env_keywords": {"constraint": "TLO"}}, 288),
+        ("neither", {}, 96),
+    ):
+        folder = train(request(tmp_path / name, **changes), evaluate=validate, make_envs=toy_envs)
+        assert load_agent(folder).identity["decisions"] == best, name
+    assert load_checkpoint(tmp_path / "id" / "checkpoint.pt")["run"]["best_score"] == (0.75, 0.95)
+    assert "75.00% safe and completed, survival 0.9500, after 288" in (tmp_path / "id" / "log.txt").read_text()
+
+
+def test_limits_are_those_of_the_constraint_or_of_lagrangian_ppo(tmp_path: Path):
+    def limits(algorithm: str, task: str, keyword: str | None = None, **changes: Any) -> dict[str, float]:
+        args = hyperparameters(algorithm, task, **changes)
+        return find_limits(RunArgs(task, args, algorithm, env_keywords={"constraint": keyword}))
+
+    assert limits("ppo", "bus14-R") == {}
+    assert limits("ppo", "bus14-R", "TLO") == {"TLO": 50.0}
+    assert limits("dqn", "bus14-T0-LSI") == {"LSI": 0.0}
+    assert limits("lagrangian-ppo", "bus14-R", "TLO", thresholds=(20.0,)) == {"TLO": 20.0}
+    assert limits("lagrangian-ppo", "bus14-T0", constraints=("LSI", "TLO")) == {"LSI": 0.0, "TLO": 50.0}
+
+
 def test_validation_does_not_disturb_training(tmp_path: Path):
     def drawing(agent: PolicyAgent) -> Mapping[str, float]:
         torch.randn(10)
@@ -182,6 +214,8 @@ def _sizes(args: Args) -> dict[str, Any]:
         ({"env_keywords": {"reward": lambda state, i: 0.0}}, "stores its reward by name"),
         ({"evaluate_every": 0}, "evaluate_every"),
         ({"task": "bus14-R"}, "Only discrete actions can be masked"),
+        ({"task": "bus14-T0-LSI", "env_keywords": {"constraint": "TLO"}}, "contradicts task 'rl2grid/bus14-T0-LSI-v0'"),
+        ({"algorithm": "lagrangian-ppo", "hyperparameters": hyperparameters("lagrangian-ppo", "bus14-T0")}, "needs a"),
     ],
 )
 def test_requests_that_cannot_be_met_leave_nothing_behind(tmp_path: Path, changes: dict[str, Any], sentence: str):

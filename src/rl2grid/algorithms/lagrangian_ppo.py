@@ -625,7 +625,8 @@ class LagrangianPPO:
         self.continuous = check_environments(
             "Lagrangian PPO", envs, num_envs=args.num_envs, mask_actions=args.mask_actions
         )
-        self.constraints, self.thresholds = _find_constraints(args, envs)
+        limits = find_limits(args, getattr(getattr(envs.unwrapped, "options", None), "constraint", None))
+        self.constraints, self.thresholds = tuple(limits), np.array(list(limits.values()), np.float64)
         self.envs = NormalizeObservation(envs) if args.normalize_observations else envs
         self.generator = torch.Generator().manual_seed(args.seed)
         observation_shape, action_space = envs.single_observation_space.shape, envs.single_action_space
@@ -939,25 +940,32 @@ class _CostTally(Tally):
         }
 
 
-def _find_constraints(args: Args, envs: VectorEnv[Any, Any, Any]) -> tuple[tuple[str, ...], NDArray[np.float64]]:
-    """Names and thresholds of the constraints: those asked for, else the task's own."""
-    of_task = getattr(getattr(envs.unwrapped, "options", None), "constraint", None)
+def find_limits(args: Args, of_task: str | None) -> dict[str, float]:
+    """Threshold by constraint: of the constraints asked for, else of the task's own.
+
+    Args:
+        args: Hyperparameters.
+        of_task: The constraint of the environments; None: they have none.
+
+    Raises:
+        UsageError: there is no constraint, or no threshold for one.
+    """
     names = args.constraints or ((of_task,) if of_task else ())
     if not names:
         raise UsageError(
-            "Lagrangian PPO needs a constraint: choose a task whose id names LSI or TLO, or set constraints, for "
-            "example to TLO."
+            "Lagrangian PPO needs a constraint: choose a task whose id names LSI or TLO, or set constraint to one of "
+            "them."
         )
     if args.thresholds:
         if len(args.thresholds) != len(names):
             raise UsageError(
                 f"Lagrangian PPO needs one threshold for each of {', '.join(names)}, not {len(args.thresholds)}."
             )
-        return names, np.array(args.thresholds, np.float64)
+        return dict(zip(names, args.thresholds, strict=True))
     for name in names:
         if name not in THRESHOLDS:
             raise one_of("Constraint without a given threshold,", name, tuple(THRESHOLDS))
-    return names, np.array([THRESHOLDS[name] for name in names], np.float64)
+    return {name: THRESHOLDS[name] for name in names}
 
 
 def _metric_names(name: str, constraints: tuple[str, ...]) -> list[str]:

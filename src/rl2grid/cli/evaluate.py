@@ -29,6 +29,7 @@ def run(options: argparse.Namespace) -> int:
         split=options.split,
         seeds=range(options.seeds),
         heuristic=heuristic,
+        constraint=None if options.constraint == "None" else options.constraint,
         engine=options.engine,
         workers=options.workers,
         output=output,
@@ -43,6 +44,8 @@ def run(options: argparse.Namespace) -> int:
 def _default_output(options: argparse.Namespace, task: str) -> Path:
     """Inside the run for one of its policies; else by task and agent."""
     name = options.split if options.heuristic is None else f"{options.split}-{options.heuristic}"
+    if options.constraint not in (None, "None"):
+        name = f"{name}-{options.constraint}"
     if options.engine != ENGINES[0]:
         name = f"{name}-{options.engine}"
     path = Path(options.agent)
@@ -58,6 +61,8 @@ def _command(options: argparse.Namespace) -> str:
     words += ["--seeds", str(options.seeds)]
     if options.heuristic is not None:
         words += ["--heuristic", options.heuristic]
+    if options.constraint is not None:
+        words += ["--constraint", options.constraint]
     if options.engine != ENGINES[0]:
         words += ["--engine", options.engine]
     return shlex.join(words)

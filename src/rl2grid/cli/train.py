@@ -25,7 +25,7 @@ usage: rl2grid train <algorithm> <task> [flags]
        rl2grid train --resume <run folder>
 
 Trains an algorithm (ppo, lagrangian-ppo, dqn, sac, td3) on a task (see `rl2grid tasks`) and writes a run folder:
-configuration, metrics.csv, tensorboard/, checkpoint.pt, best.pt by validation survival, log.txt. A run that was
+configuration, metrics.csv, tensorboard/, checkpoint.pt, best.pt by validation, log.txt. A run that was
 interrupted goes on with --resume. Flags and their defaults with --help after the task, for example
 `rl2grid train ppo bus14-T0 --help`.
 """
@@ -43,6 +43,8 @@ class TrainFlags:
     """What plays while the grid is safe: None, ``idle`` or ``recovery``."""
     reward: str = "default"
     """Reward preset: ``default``, ``paper`` or ``released``."""
+    constraint: str | None = None
+    """Safety constraint: ``LSI`` or ``TLO``, for tasks whose id names none; None: that of the id."""
     engine: str = "native"
     """``native``, or ``reference``: Grid2Op itself."""
     dispatch: str = "exact"
@@ -63,7 +65,7 @@ class TrainFlags:
     """A checkpoint is written when the last one is older than this, and at the end."""
 
 
-_ENV_KEYWORDS = ("engine", "heuristic", "reward", "dispatch", "maintenance", "opponent")
+_ENV_KEYWORDS = ("constraint", "engine", "heuristic", "reward", "dispatch", "maintenance", "opponent")
 
 
 def train(command_line: list[str]) -> int:
@@ -133,7 +135,7 @@ def _report(folder: Path, task_id: str) -> int:
 
 
 def _preset(flags: list[str]) -> str:
-    for flag, value in zip(flags, [*flags[1:], ""], strict=True):
+    for flag, value in zip(flags, [*flags, ""][1:], strict=True):
         if flag == "--preset":
             return value
         if flag.startswith("--preset="):
@@ -186,6 +188,6 @@ def _refuse_unknown(flags: list[str], known: list[Field[Any]]) -> None:
 
 def _validator(args: RunArgs) -> Callable[[PolicyAgent], Mapping[str, float]]:
     from rl2grid.experiments.evaluation import validator
+    from rl2grid.experiments.runs import find_limits
 
-    keywords = args.env_keywords
-    return validator(args.task, engine=keywords["engine"], workers=args.num_workers)
+    return validator(args.task, limits=find_limits(args), engine=args.env_keywords["engine"], workers=args.num_workers)

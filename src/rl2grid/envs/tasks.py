@@ -74,6 +74,20 @@ def find_task(task_id: str) -> Task:
     raise _unknown_task(task_id, name)
 
 
+def constraint_of(task: Task, keyword: str | None) -> str | None:
+    """The constraint of environments of ``task`` that are made with the keyword ``constraint``.
+
+    Raises:
+        UsageError: the id and the keyword name different ones.
+    """
+    if task.constraint and keyword and keyword != task.constraint:
+        raise UsageError(
+            f"constraint={keyword!r} contradicts task {task.id!r}: leave it out, or choose the task without "
+            f"{task.constraint} in its id."
+        )
+    return task.constraint or keyword
+
+
 def _unknown_task(task_id: str, name: str) -> UsageError:
     # The longest grid that begins the name: "bus36-MO-v0-T9" is about bus36-MO-v0.
     grids = [grid_id for grid_id in GRID_IDS if name.startswith(f"{grid_id}-")]

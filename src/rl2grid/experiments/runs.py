@@ -6,7 +6,7 @@ A run folder holds
 - ``metrics.csv`` and ``tensorboard/``: see :mod:`rl2grid.algorithms.metrics`;
 - ``checkpoint.pt``: everything needed to go on, see :mod:`rl2grid.algorithms.checkpoint`;
 - ``replay/``: what DQN, SAC and TD3 remember, until the run is finished, see :mod:`rl2grid.algorithms.replay`;
-- ``best.pt``: the policy with the highest validation survival so far, the latest of equals;
+- ``best.pt``: the best policy on the validation scenarios so far, see :func:`score`;
 - ``log.txt``: what happened when.
 
 A run that was interrupted and resumed any number of times ends with the same weights, bit for bit, and
@@ -23,7 +23,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Protocol
@@ -38,9 +38,10 @@ from rl2grid.algorithms.metrics import MetricsWriter
 from rl2grid.algorithms.off_policy import OffPolicyTrainer
 from rl2grid.algorithms.policy_agent import BEST_FILE, CHECKPOINT_FILE, PolicyAgent
 from rl2grid.envs.registration import register_all
-from rl2grid.envs.tasks import Task, TaskOptions, find_task
+from rl2grid.envs.tasks import Task, TaskOptions, constraint_of, find_task
 from rl2grid.errors import UsageError, one_of
 from rl2grid.mdp.actions import action_set_hash
+from rl2grid.mdp.constraints import THRESHOLDS
 from rl2grid.scenarios.library import generator_version, scenario_pack_hash
 from rl2grid.scenarios.splits import TRAIN
 from rl2grid.versions import library_versions
@@ -52,7 +53,8 @@ REPLAY_FOLDER = "replay"
 
 VectorEnvironment = gymnasium.vector.VectorEnv[Any, Any, Any]
 Evaluate = Callable[[PolicyAgent], Mapping[str, float]]
-"""Plays the validation scenarios and returns means over them, ``survival`` among them."""
+"""Plays the validation scenarios and returns means over them: ``survival``, under constraints also
+``safe_completed``, and whatever else is to be recorded."""
 Hyperparameters = ppo.Args | lagrangian_ppo.Args | dqn.Args | sac.Args | td3.Args
 
 
@@ -143,6 +145,30 @@ def hyperparameters(algorithm: str, task: str, preset: str = "default", **change
         if name not in known:
             raise one_of(f"Hyperparameter of {algorithm}", name, known)
     return chosen.preset(preset, continuous=find_task(task).kind == "R", **changes)
+
+
+def find_limits(args: RunArgs) -> dict[str, float]:
+    """What the costs of a safe episode may reach, by constraint; empty without a constraint.
+
+    The constraint is the task's, or that of the keyword ``constraint``; Lagrangian PPO may have others of its own.
+
+    Raises:
+        UsageError: Lagrangian PPO without a constraint, or a keyword that contradicts the task's id.
+    """
+    constraint = constraint_of(find_task(args.task), args.env_keywords.get("constraint"))
+    if isinstance(args.hyperparameters, lagrangian_ppo.Args):
+        return lagrangian_ppo.find_limits(args.hyperparameters, constraint)
+    return {constraint: THRESHOLDS[constraint]} if constraint else {}
+
+
+def score(means: Mapping[str, float], limits: Mapping[str, float]) -> tuple[float, ...]:
+    """What the best policy has most of, in the order of importance; of equals the latest is kept.
+
+    Under constraints the share of validation episodes that were completed within all ``limits``, then survival;
+    without any, survival.
+    """
+    names = ("safe_completed", "survival") if limits else ("survival",)
+    return tuple(float(means[name]) for name in names)
 
 
 def make_envs(args: RunArgs) -> VectorEnvironment:
@@ -271,7 +297,9 @@ class _Run:
         self.identity = identity
         self.trainer = trainer
         self.evaluate = evaluate
-        self.best_survival: float | None = None
+        self.limits = find_limits(args)
+        self.best_score: tuple[float, ...] | None = None
+        """Of ``best.pt``; see :func:`score`."""
         self.wall_time = 0.0
         """Seconds of training and validation, those before interruptions included."""
 
@@ -290,7 +318,7 @@ class _Run:
     def save(self) -> None:
         """Write ``checkpoint.pt``."""
         run = {
-            "best_survival": self.best_survival,
+            "best_score": self.best_score,
             "wall_time": self.wall_time,
             "finished": self.trainer.finished,
         }
@@ -300,7 +328,7 @@ class _Run:
     def load(self, checkpoint: Mapping[str, Any]) -> None:
         """Be where the run was when ``checkpoint`` was written."""
         self.trainer.load_state_dict(checkpoint["training"])
-        self.best_survival = checkpoint["run"]["best_survival"]
+        self.best_score = checkpoint["run"]["best_score"]
         self.wall_time = checkpoint["run"]["wall_time"]
 
     def validate(self) -> dict[str, float]:
@@ -308,13 +336,22 @@ class _Run:
         assert self.evaluate is not None
         contents = self.contents()
         result = self.evaluate(PolicyAgent(contents))
-        survival = float(result["survival"])
+        reached = score(result, self.limits)
         # Of equally good policies the latest: it has learned from more than the validation scenarios show.
-        if self.best_survival is None or survival >= self.best_survival:
-            self.best_survival = survival
-            save_checkpoint(self.folder / BEST_FILE, {**contents, "run": {"survival": survival}})
-            self.note(f"best validation survival {survival:.4f} after {self.trainer.decisions} decisions")
+        if self.best_score is None or reached >= self.best_score:
+            self.best_score = reached
+            save_checkpoint(self.folder / BEST_FILE, {**contents, "run": {"score": reached}})
+            safe = f"{result['safe_completed']:.2%} safe and completed, " if self.limits else ""
+            self.note(
+                f"best validation so far: {safe}survival {result['survival']:.4f}, "
+                f"after {self.trainer.decisions} decisions"
+            )
         return {f"validation/{name}": float(value) for name, value in result.items()}
+
+    @property
+    def best_survival(self) -> float | None:
+        """Validation survival of ``best.pt``."""
+        return None if self.best_score is None else self.best_score[-1]
 
     def note(self, text: str) -> None:
         """Append a line to the log."""
@@ -443,14 +480,9 @@ def _resolved(args: RunArgs) -> RunArgs:
     if args.evaluate_every < 1:
         raise UsageError(f"evaluate_every must be at least 1 decision, not {args.evaluate_every}.")
     folder = args.folder or Path("runs") / f"{_slug(task)}-{args.algorithm}-{args.hyperparameters.seed}"
-    return RunArgs(
-        **{
-            **{item.name: getattr(args, item.name) for item in fields(RunArgs)},
-            "task": task.id,
-            "folder": Path(folder),
-            "env_keywords": keywords,
-        }
-    )
+    resolved = replace(args, task=task.id, folder=Path(folder), env_keywords=keywords)
+    find_limits(resolved)  # refuses what cannot be constrained
+    return resolved
 
 
 def _slug(task: Task) -> str:
