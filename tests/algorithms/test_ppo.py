@@ -280,6 +280,14 @@ def test_the_ratio_before_any_update_is_one(continuous: bool):
     assert float(loss.clip_fraction) == 0.0
 
 
+@BOTH
+def test_the_first_minibatch_of_an_update_has_ratios_of_one(continuous: bool):
+    """The update reads the actions and probabilities that were played."""
+    metrics = trainer(continuous, num_minibatches=1, update_epochs=1).iterate()
+    assert metrics["losses/approx_kl"] == pytest.approx(0.0, abs=1e-6)
+    assert metrics["losses/clipfrac"] == 0.0
+
+
 def test_continuous_actions_are_played_clipped_and_learned_unclipped():
     envs = Recording(4, continuous=True)
     rollout = first_rollout(PPO(SMALL_CONTINUOUS, envs))

@@ -70,6 +70,7 @@ def test_costs_and_scores_are_added(state):
     state.line_status[0, 1] = False
     state.topo_vect[0, 5] = 2
     play(state, [(1.0, 0.0, 0.0)] * 2)
+    assert state.transition_costs[0].tolist() == [0, 4]
     begin_transition(state, 0)
     play(state, [(1.0, 0.0, 0.0)])
     assert state.transition_costs[0].tolist() == [0, 2]

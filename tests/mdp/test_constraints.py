@@ -47,6 +47,11 @@ def test_lsi_by_reason(state, reason, cost):
     assert lsi_cost(state, 0) == cost
 
 
+def test_completing_the_month_is_not_charged(state):
+    state.truncated[0] = True
+    assert lsi_cost(state, 0) == 0
+
+
 def test_tlo_counts_what_the_definition_counts(random_rows):
     alive = ~random_rows.terminated
     counted = ~random_rows.line_status | (random_rows.rho > 1)
