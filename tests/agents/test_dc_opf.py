@@ -9,7 +9,8 @@ import pytest
 import rl2grid  # noqa: F401  (registers the tasks)
 from rl2grid.agents.agent import Agent
 from rl2grid.agents.dc_flow import buses, dc_flow, dc_point, sensitivities
-from rl2grid.agents.dc_opf import Control, DcOpf, controls, encode, optimal_injections
+from rl2grid.agents.dc_opf import DcOpf, optimal_injections
+from rl2grid.agents.dispatch import Control, controls, encode
 from rl2grid.errors import UsageError
 from rl2grid.experiments.agents import make_agent
 from rl2grid.mdp.actions import decode_continuous

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import ctypes
+import os
+import sys
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import numpy as np
@@ -73,23 +77,28 @@ class Programme:
         self.at_most(terms, bound.plus(Affine(centre)))
         self.at_most(((column, -value) for column, value in terms), bound.plus(Affine(-centre)))
 
-    def solve(self, time_limit: float) -> F64 | None:
-        """The best values found, float64 [column]; None if there are none, or none were found in time.
+    def solve(self, time_limit: float, node_limit: int | None = None) -> F64 | None:
+        """The best values found, float64 [column]; None if there are none, or none were found within the limits.
 
         Args:
             time_limit: seconds that the solver may take.
+            node_limit: nodes of the branch-and-bound tree that it may solve; None: any number.
         """
         shape = len(self._rows), len(self._cost)
         row, column, value = np.array(self._entries, np.float64).reshape(-1, 3).T
         matrix = csr_array((value, (row.astype(np.int32), column.astype(np.int32))), shape)
         lower, upper = np.array(self._rows, np.float64).reshape(-1, 2).T
-        result = milp(
-            np.array(self._cost),
-            integrality=np.array(self._integer, np.int64),
-            bounds=Bounds(*np.array(self._bounds).T),
-            constraints=LinearConstraint(matrix, lower, upper),
-            options={"time_limit": time_limit, "mip_rel_gap": _GAP},
-        )
+        options = {"time_limit": time_limit, "mip_rel_gap": _GAP}
+        if node_limit is not None:
+            options["node_limit"] = node_limit
+        with _silent_standard_output():
+            result = milp(
+                np.array(self._cost),
+                integrality=np.array(self._integer, np.int64),
+                bounds=Bounds(*np.array(self._bounds).T),
+                constraints=LinearConstraint(matrix, lower, upper),
+                options=options,
+            )
         return None if result.x is None else np.asarray(result.x, np.float64)
 
     def _add(self, lower: float, upper: float, cost: float, integer: bool) -> int:
@@ -97,3 +106,23 @@ class Programme:
         self._bounds.append((lower, upper))
         self._integer.append(integer)
         return len(self._cost) - 1
+
+
+@contextmanager
+def _silent_standard_output() -> Iterator[None]:
+    """Drop what compiled code prints.
+
+    HiGHS prints a line from ``transformNewIntegerFeasibleSolution`` with ``printf``, whatever it is told about output.
+    """
+    c_library = ctypes.CDLL(None)
+    sys.stdout.flush()
+    c_library.fflush(None)
+    kept = os.dup(1)
+    try:
+        with open(os.devnull, "wb") as nowhere:
+            os.dup2(nowhere.fileno(), 1)
+        yield
+    finally:
+        c_library.fflush(None)  # what is still in the library's buffer would be written after the return
+        os.dup2(kept, 1)
+        os.close(kept)

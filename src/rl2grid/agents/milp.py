@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from rl2grid.agents.agent import Action, Info, Observation
 from rl2grid.agents.dc_flow import DcPoint, buses, dc_flow, dc_point, is_connected
 from rl2grid.agents.linear_programme import F64, Affine, Programme
+from rl2grid.envs.foresight import busbars_after
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
 from rl2grid.mdp.actions import ActionCatalogue, ActionKind, full_catalogue, moved_elements
@@ -39,7 +40,10 @@ class Milp:
     out and the programme solved again.
 
     Args:
-        time_limit: seconds that the solver may take per decision; the best choice found by then counts.
+        node_limit: nodes of the branch-and-bound tree that the solver may visit per programme; the best choice found by
+            then counts, the same on every machine.
+        time_limit: seconds that the solver may take per decision: a safety net, since what it cuts short depends
+            on the machine.
         attempts: choices that are checked per decision.
 
     Raises:
@@ -48,12 +52,14 @@ class Milp:
 
     name = "milp"
 
-    def __init__(self, time_limit: float = 2.0, attempts: int = 3) -> None:
+    def __init__(self, node_limit: int = 100, time_limit: float = 60.0, attempts: int = 3) -> None:
+        if node_limit < 1:
+            raise UsageError(f"node_limit={node_limit!r} is not allowed: give at least 1.")
         if not time_limit > 0:
             raise UsageError(f"time_limit={time_limit!r} is not allowed: give a positive number of seconds.")
         if attempts < 1:
             raise UsageError(f"attempts={attempts!r} is not allowed: give at least 1.")
-        self._time_limit, self._attempts = time_limit, attempts
+        self._node_limit, self._time_limit, self._attempts = node_limit, time_limit, attempts
 
     def bind(self, env: gymnasium.Env[Any, Any]) -> None:
         """Look up the actions of the task and the electrical model of its grid.
@@ -92,7 +98,9 @@ class Milp:
             left = deadline - time.monotonic()
             if left <= 0:
                 return _NOTHING
-            action = best_action(self._grid, point, self._catalogue, allowed, self._last_busbar, left, ruled_out)
+            action = best_action(
+                self._grid, point, self._catalogue, allowed, self._last_busbar, left, ruled_out, self._node_limit
+            )
             if action == _NOTHING or self._helps(action):
                 return action
             ruled_out.add(action)
@@ -112,6 +120,7 @@ def best_action(
     last_busbar: I32,
     time_limit: float,
     ruled_out: AbstractSet[int] = frozenset(),
+    node_limit: int | None = None,
 ) -> int:
     """The action after which the largest DC loading is least; 0 if none is better than doing nothing.
 
@@ -125,14 +134,15 @@ def best_action(
         last_busbar: to which busbar the end of an open line returns, int32 [topo].
         time_limit: seconds for the solver.
         ruled_out: actions that may not be chosen.
+        node_limit: nodes of the branch-and-bound tree per programme; None: any number.
     """
     deadline = time.monotonic() + time_limit
     excluded = set(ruled_out)
     while (left := deadline - time.monotonic()) > 0:
         topology = _Topology(grid, point, catalogue, allowed, last_busbar, excluded)
-        values = topology.programme.solve(left)
+        values = topology.programme.solve(left, node_limit)
         action = _NOTHING if values is None else topology.chosen(values)
-        if action == _NOTHING or is_connected(grid, _after(grid, point, catalogue, last_busbar, action)):
+        if action == _NOTHING or is_connected(grid, busbars_after(grid, point.busbar, last_busbar, catalogue[action])):
             return action
         # Flow balance excludes islands, but for those that need no power, such as a line with dead ends only.
         excluded.add(action)
@@ -337,16 +347,3 @@ class _Topology:
 def _widest_angle(differences: F64, n_bus: int) -> float:
     """A bound on the angle between two buses: a path between them has fewer lines than the grid has buses."""
     return float(np.sort(differences)[::-1][:n_bus].sum())
-
-
-def _after(grid: Grid, point: DcPoint, catalogue: ActionCatalogue, last_busbar: I32, action: int) -> I32:
-    """The busbar of each element after an action, int32 [topo]."""
-    busbar, step = point.busbar.copy(), catalogue[action]
-    if step.kind == ActionKind.MOVE:
-        elements = moved_elements(grid, step.target, step.mask)
-        elements = elements[busbar[elements] > 0]
-        busbar[elements] = 3 - busbar[elements]
-    elif step.kind == ActionKind.SWITCH:
-        ends = [int(grid.line_or_pos_topo_vect[step.target]), int(grid.line_ex_pos_topo_vect[step.target])]
-        busbar[ends] = -1 if (busbar[ends] > 0).any() else last_busbar[ends]
-    return busbar

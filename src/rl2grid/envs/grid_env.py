@@ -187,16 +187,22 @@ class PowerGridEnv(gymnasium.Env[NDArray[np.float32], Any], TaskDescription):
         """
         return self._player.what_if(0, actions)
 
-    def security(self) -> OutageOutcomes:
-        """What the loss of each line would do to the present loadings (N-1), in one call; see ``docs/what_if.md``.
+    def security(self, action: int | None = None) -> OutageOutcomes:
+        """What the loss of each line would do (N-1), in one call; see ``docs/what_if.md``.
+
+        Args:
+            action: the topology action after which lines are lost, in the next step, by its forecast; None: they are
+                lost now, with the present injections.
 
         Returns:
-            Arrays of one entry per line: ``worst_loading``, ``verdict``, ``overloads`` and ``was_open``.
+            Arrays of one entry per line: ``worst_loading``, ``verdict``, ``overloads`` and ``was_open``. Cooldowns do
+            not count.
 
         Raises:
-            UsageError: no episode in progress, or the reference engine.
+            UsageError: continuous actions, an action that does not exist, no episode in progress, or the reference
+                engine.
         """
-        return self._player.security(0)
+        return self._player.security(0) if action is None else self._player.security_after(0, action)
 
     def n_minus_1_score(self) -> float:
         """Share of the lines in service whose loss would leave neither an overload nor a collapse.

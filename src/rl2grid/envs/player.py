@@ -37,7 +37,7 @@ from rl2grid.scenarios.scenario import STEP
 
 if TYPE_CHECKING:
     from rl2grid.engines.native.engine import NativeEngine
-    from rl2grid.engines.native.what_if import ActionOutcomes, OutageOutcomes
+    from rl2grid.engines.native.what_if import ActionOutcomes, OutageOutcomes, WhatIf
 
 _RESET_OPTIONS = ("scenario", "start")
 
@@ -104,6 +104,7 @@ class TaskPlayer:
         self._plans: list[EpisodePlan | None] = [None] * n
         self._seats: list[Seat | None] = [None] * n
         self._pending = np.zeros(n, np.bool_)  # the episode ended inside reset, its ending is still to be returned
+        self._solver: WhatIf | None = None
 
     @property
     def state(self) -> GridState:
@@ -209,6 +210,19 @@ class TaskPlayer:
         from rl2grid.engines.native.what_if import outages
 
         return outages(self._native_engine(i), i)
+
+    def security_after(self, i: int, action: int) -> OutageOutcomes:
+        """What the loss of each line would do after an action; see :meth:`PowerGridEnv.security`."""
+        if self._catalogue is None:
+            raise UsageError(f"{self.task.id} has continuous actions: N-1 after an action is of topology actions.")
+        played = self._catalogue[action_number(action, len(self._catalogue))]
+        engine = self._native_engine(i)
+        from rl2grid.engines.native.what_if import WhatIf
+        from rl2grid.envs.foresight import outages_after
+
+        if self._solver is None:
+            self._solver = WhatIf(self.grid, engine.arrays.network)
+        return outages_after(engine, i, played, self._solver)
 
     def n_minus_1_score(self, i: int) -> float:
         """Share of the outages that leave the grid safe; see :meth:`PowerGridEnv.n_minus_1_score`."""

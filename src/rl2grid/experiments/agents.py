@@ -9,6 +9,7 @@ from rl2grid.agents.agent import Agent
 from rl2grid.agents.dc_opf import DcOpf
 from rl2grid.agents.do_nothing import DoNothing
 from rl2grid.agents.greedy import Greedy
+from rl2grid.agents.greedy_topology import GreedyN1
 from rl2grid.agents.milp import Milp
 from rl2grid.agents.random_agent import RandomAgent
 from rl2grid.agents.recovery import Recovery
@@ -19,6 +20,7 @@ AGENTS: dict[str, Callable[[], Agent]] = {
     RandomAgent.name: RandomAgent,
     Recovery.name: Recovery,
     Greedy.name: Greedy,
+    GreedyN1.name: GreedyN1,
     Milp.name: Milp,
     DcOpf.name: DcOpf,
 }

@@ -1,0 +1,160 @@
+"""Greedy search among topology actions, by worst loading or by security (``docs/algorithms/greedy.md``)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from rl2grid.agents.agent import Action, Info, Observation
+from rl2grid.agents.recovery import Recovery
+from rl2grid.errors import UsageError
+from rl2grid.grids import Grid
+from rl2grid.mdp.actions import ActionCatalogue, ActionKind, full_catalogue
+from rl2grid.mdp.heuristics import SAFE_RHO, is_safe
+from rl2grid.mdp.state import GridState
+
+F64 = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+I64 = NDArray[np.int64]
+
+_NOTHING = 0
+_WORTHWHILE = 1e-3
+"""Least decrease of the worst loading for which an action is played."""
+_NEAR = 0.03
+"""Worst loadings above the least one by less are good enough to be chosen for their security."""
+_CANDIDATES = 10
+"""Actions whose security is looked at, and do nothing."""
+
+
+class GreedyTopology:
+    """While the grid is not safe, plays the action with the lowest worst loading in the next step, by its forecast.
+
+    All actions are tried at once with the AC power flow (:meth:`PowerGridEnv.what_if`). Of those that
+    make the grid safe, one that restores a line or a substation is preferred, then one that a single action can undo.
+    While the grid is safe, it plays what :class:`Recovery` plays, if the forecast then stays safe.
+
+    Args:
+        actions: ids that it may play, do nothing always being one of them; None: all of the task.
+    """
+
+    name = "greedy"
+
+    def __init__(self, actions: Sequence[int] | None = None) -> None:
+        self._recovery = Recovery()
+        self._chosen = None if actions is None else [_NOTHING, *sorted(set(actions) - {_NOTHING})]
+
+    def bind(self, env: gymnasium.Env[Any, Any]) -> None:
+        """Remember the environment, which is asked for forecasts.
+
+        Raises:
+            UsageError: the task has no topology actions.
+        """
+        if not isinstance(env.action_space, gymnasium.spaces.Discrete):
+            raise UsageError(
+                f"Agent {self.name!r} cannot play a redispatching task (-R-), which has no topology actions: "
+                "choose a topology task (-T0-, -T1-, ...) or the agent 'greedy'."
+            )
+        base: Any = env.unwrapped
+        self._env = base
+        self._recovery.bind(env)
+        ids = np.arange(len(base.action_catalogue_ids)) if self._chosen is None else np.array(self._chosen)
+        self._ids = ids.tolist()
+        self._catalogue = full_catalogue(base.grid).take(base.action_catalogue_ids[ids])
+
+    def reset(self, i: int) -> None:
+        """Nothing to forget."""
+
+    def act(self, observation: Observation, info: Info) -> Action:
+        """The id of the best action; 0 where none is better than doing nothing."""
+        if is_safe(self._env.state, 0):
+            return self._recover(observation, info)
+        outcomes = self._env.what_if(self._ids)
+        loading = np.where(outcomes.legal, outcomes.worst_loading, np.inf).astype(np.float64)
+        if not loading.min() < loading[_NOTHING] - _WORTHWHILE:
+            return _NOTHING
+        return int(self._ids[self._best(loading)])
+
+    def _best(self, loading: F64) -> int:
+        """The entry to play, given the worst loading after each: one of them is better than do nothing."""
+        effect = effects(self._env.grid, self._env.state, self._catalogue)
+        safe = loading < min(float(SAFE_RHO), float(loading[_NOTHING]) - _WORTHWHILE)
+        for preferred in (safe & effect.restores, safe & effect.can_be_undone):
+            if preferred.any():
+                return int(np.where(preferred, loading, np.inf).argmin())
+        return int(loading.argmin())
+
+    def _recover(self, observation: Observation, info: Info) -> Action:
+        """The recovery heuristic's action, if it keeps the grid as safe as the heuristic asks."""
+        action = self._recovery.act(observation, info)
+        if action == _NOTHING or action not in self._ids:
+            return _NOTHING
+        worst = self._env.what_if([action]).worst_loading[0]
+        return action if worst < SAFE_RHO else _NOTHING
+
+
+class GreedyN1(GreedyTopology):
+    """As :class:`GreedyTopology`, but of the best actions by worst loading it plays the most secure one.
+
+    Security is that of the topology after the action to the loss of any one line (N-1, :func:`insecurity`).
+    """
+
+    name = "greedy-n1"
+
+    def _best(self, loading: F64) -> int:
+        ranked = np.argsort(loading, kind="stable")[:_CANDIDATES].astype(np.int32)
+        acceptable = min(float(loading.min()) + _NEAR, float(loading[_NOTHING]) - _WORTHWHILE)
+        candidates = ranked[loading[ranked] < acceptable]
+        undoable = effects(self._env.grid, self._env.state, self._catalogue.take(candidates)).can_be_undone
+        candidates = candidates[undoable] if undoable.any() else candidates
+        danger = np.array([insecurity(self._env.security(self._ids[entry])) for entry in candidates.tolist()])
+        return int(candidates[np.lexsort((loading[candidates], danger))[0]])
+
+
+def insecurity(outcomes: Any) -> float:
+    """Sum over the outages of the overload that each leaves: of its worst line, at most 1; 1 for a collapse.
+
+    Args:
+        outcomes: what :meth:`PowerGridEnv.security` returns.
+    """
+    lost = ~outcomes.was_open
+    return float(np.clip(outcomes.worst_loading[lost].astype(np.float64) - 1.0, 0.0, 1.0).sum())
+
+
+class Effect(NamedTuple):
+    """What actions do to the way back to the reference topology; bool [action]."""
+
+    restores: Flags
+    """It closes a line, or brings a substation back to busbar 1."""
+    can_be_undone: Flags
+    """One action of the catalogue brings back what it changes."""
+
+
+def effects(grid: Grid, state: GridState, catalogue: ActionCatalogue) -> Effect:
+    """What each action would do to the topology of row 0.
+
+    A move from the reference is undone by itself; a second one in the same substation may leave a division that no
+    action of a low level takes back.
+    """
+    switches, moves = catalogue.kind == ActionKind.SWITCH, catalogue.kind == ActionKind.MOVE
+    restores, can_be_undone = np.zeros(len(catalogue), np.bool_), np.ones(len(catalogue), np.bool_)
+    restores[switches] = ~state.line_status[0][catalogue.target[switches]]
+    on_second, connected = _masks(grid, state.topo_vect[0] == 2), _masks(grid, state.topo_vect[0] > 0)
+    subs, masks = catalogue.target[moves], catalogue.mask[moves].astype(np.int64)
+    after = (on_second[subs] ^ masks) & connected[subs]
+    restores[moves] = (after == 0) & (on_second[subs] != 0)
+    way_back = set(zip(subs.tolist(), masks.tolist(), strict=True))
+    keys = zip(subs.tolist(), after.tolist(), strict=True)
+    can_be_undone[moves] = [mask == 0 or (sub, mask) in way_back for sub, mask in keys]
+    return Effect(restores, can_be_undone)
+
+
+def _masks(grid: Grid, flags: NDArray[np.bool_]) -> I64:
+    """The flagged elements of each substation as the mask of a move, int64 [sub]."""
+    place = np.arange(grid.dim_topo) - grid.sub_first_element[grid.element_to_subid]
+    masks = np.zeros(grid.n_sub, np.int64)
+    np.add.at(masks, grid.element_to_subid[flags], np.int64(1) << place[flags])
+    return masks
