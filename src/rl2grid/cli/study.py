@@ -103,15 +103,14 @@ def _status(options: argparse.Namespace) -> int:
 
 def _list(options: argparse.Namespace) -> int:
     _check_installed()
-    import tomllib
-
     from rl2grid.experiments.study import included_studies, parse_study
+    from rl2grid.experiments.study_file import read_toml
 
     table = Table(box=None, pad_edge=False)
     for column in ("study", "scale", "cells", "decisions"):
         table.add_column(column, no_wrap=True, justify="left" if column in ("study", "scale") else "right")
     for name, path in included_studies().items():
-        contents = tomllib.loads(path.read_text(encoding="utf-8"))
+        contents = read_toml(path)
         for scale in contents.get("scale", {None: {}}):
             cells = parse_study(contents, scale).cells
             table.add_row(name, scale or "", str(len(cells)), f"{sum(cell.decisions for cell in cells):,}")

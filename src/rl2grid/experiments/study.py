@@ -22,9 +22,7 @@ See ``docs/studies.md`` for all keys. Everything is checked before anything begi
 
 from __future__ import annotations
 
-import difflib
 import itertools
-import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from importlib import resources
@@ -36,6 +34,18 @@ from rl2grid.envs.tasks import TaskOptions, find_task
 from rl2grid.errors import UsageError
 from rl2grid.experiments import runs
 from rl2grid.experiments.agents import AGENTS
+from rl2grid.experiments.study_file import (
+    as_table,
+    check_kind,
+    count,
+    read_toml,
+    refuse_unknown_keys,
+    table_of,
+    text,
+    unknown,
+    upper,
+    with_tuples,
+)
 from rl2grid.scenarios.library import list_scenarios
 from rl2grid.scenarios.splits import SPLITS
 
@@ -100,9 +110,7 @@ class Cell:
 
     def scenarios(self, split: str) -> tuple[str, ...]:
         """The months that are played of a split."""
-        listed = list_scenarios(find_task(self.task).grid_id, split)
-        count = min(self.months or len(listed), len(listed))
-        return tuple(listed[k * len(listed) // count] for k in range(count))
+        return evenly_spread(self.task, split, self.months)
 
 
 @dataclass(frozen=True)
@@ -121,6 +129,13 @@ class Study:
     def folder(self, cell: Cell) -> Path:
         """Where a cell is kept."""
         return self.output / "cells" / cell.name
+
+
+def evenly_spread(task: str, split: str, months: int | None) -> tuple[str, ...]:
+    """Some months of a split, evenly spread over it; ``months`` None: all."""
+    listed = list_scenarios(find_task(task).grid_id, split)
+    number = min(months or len(listed), len(listed))
+    return tuple(listed[k * len(listed) // number] for k in range(number))
 
 
 def included_studies() -> dict[str, Path]:
@@ -144,21 +159,17 @@ def load_study(file: str, scale: str | None = None, output: Path | None = None) 
     path = included_studies().get(file) or Path(file)
     if not path.is_file():
         allowed = [*included_studies(), "the path of a TOML file"]
-        raise _unknown("Study", file, allowed)
-    try:
-        contents = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path} is no TOML file: {error}.") from None
-    return parse_study(contents, scale, output)
+        raise unknown("Study", file, allowed)
+    return parse_study(read_toml(path), scale, output)
 
 
 def parse_study(contents: Mapping[str, Any], scale: str | None = None, output: Path | None = None) -> Study:
     """Check the contents of a file; see :func:`load_study`."""
-    _refuse_unknown_keys("the study", contents, (*_STUDY_KEYS, *_SETTINGS))
-    name = _text("the study", contents, "name")
-    scales = _table("the study", contents, "scale")
+    refuse_unknown_keys("the study", contents, (*_STUDY_KEYS, *_SETTINGS))
+    name = text("the study", contents, "name")
+    scales = table_of("the study", contents, "scale")
     for each, values in scales.items():
-        _refuse_unknown_keys(f"scale {each!r}", _as_table(f"scale {each!r}", values), _SETTINGS)
+        refuse_unknown_keys(f"scale {each!r}", as_table(f"scale {each!r}", values), _SETTINGS)
     chosen = _chosen_scale(scales, scale)
     groups = contents.get("group")
     if not isinstance(groups, list) or not groups or not all(isinstance(group, dict) for group in groups):
@@ -170,14 +181,14 @@ def parse_study(contents: Mapping[str, Any], scale: str | None = None, output: P
         for cell in _Group(f"group {group.get('label', number)}", group, shared, chosen, tuple(scales)).cells()
     ]
     _refuse_equal_names(cells)
-    base = output or Path(_text("the study", contents, "output", f"studies/{name}"))
+    base = output or Path(text("the study", contents, "output", f"studies/{name}"))
     return Study(
         name=name,
         output=base / chosen if chosen else base,
         scale=chosen,
-        retries=_count("the study", "retries", contents.get("retries", DEFAULT_RETRIES), 0),
+        retries=count("the study", "retries", contents.get("retries", DEFAULT_RETRIES), 0),
         cells=tuple(cells),
-        slurm=_table("the study", contents, "slurm"),
+        slurm=table_of("the study", contents, "slurm"),
     )
 
 
@@ -192,10 +203,10 @@ def cell_from_dict(stored: Mapping[str, Any]) -> Cell:
     Raises:
         TypeError: the entries are not those of a cell.
     """
-    cell = {**stored, "environment": _with_tuples(stored["environment"])}
+    cell = {**stored, "environment": with_tuples(stored["environment"])}
     if cell["training"] is not None:
         training = cell["training"]
-        cell["training"] = Training(**{**training, "hyperparameters": _with_tuples(training["hyperparameters"])})
+        cell["training"] = Training(**{**training, "hyperparameters": with_tuples(training["hyperparameters"])})
     return Cell(**cell)
 
 
@@ -210,7 +221,7 @@ class _Group:
         scale: str | None,
         scales: tuple[str, ...],
     ) -> None:
-        _refuse_unknown_keys(where, table, (*_PRODUCT_KEYS, *_SETTINGS))
+        refuse_unknown_keys(where, table, (*_PRODUCT_KEYS, *_SETTINGS))
         self.where, self.table, self.shared = where, table, shared
         self.scale, self.scales = scale, scales
 
@@ -220,7 +231,7 @@ class _Group:
         tasks = [find_task(task).id for task in self._names("tasks")]
         heuristics = self._names("heuristics", (NO_HEURISTIC, *HEURISTICS)) or [NO_HEURISTIC]
         if not tasks or not (algorithms or agents):
-            raise UsageError(f"{_upper(self.where)} needs tasks, and algorithms or agents.")
+            raise UsageError(f"{upper(self.where)} needs tasks, and algorithms or agents.")
         self._check_hyperparameters(algorithms)
         for task, heuristic in itertools.product(tasks, heuristics):
             for agent in agents:
@@ -231,18 +242,18 @@ class _Group:
                 try:
                     training.resolved(task)
                 except UsageError as error:
-                    raise UsageError(f"{_upper(self.where)}: {error}") from None
+                    raise UsageError(f"{upper(self.where)}: {error}") from None
                 yield self._cell(algorithm, task, heuristic, training)
 
     def _cell(self, agent: str, task: str, heuristic: str, training: Training | None) -> Cell:
-        label = _text(self.where, self.table, "label", "")
+        label = text(self.where, self.table, "label", "")
         parts = [task.removeprefix("rl2grid/"), agent, heuristic if heuristic != NO_HEURISTIC else "", label]
         if training is not None:
             parts.append(str(training.seed))
         chosen = None if heuristic == NO_HEURISTIC else heuristic
         split = self._setting("split", "test")
         if split not in SPLITS:
-            raise _unknown(f"{_upper(self.where)}: split", split, SPLITS)
+            raise unknown(f"{upper(self.where)}: split", split, SPLITS)
         months = self._setting("months", None)
         return Cell(
             name="-".join(part for part in parts if part),
@@ -251,8 +262,8 @@ class _Group:
             heuristic=chosen,
             environment=self._environment(chosen),
             split=split,
-            months=None if months is None else _count(self.where, "months", months, 1),
-            evaluation_seeds=_count(self.where, "evaluation_seeds", self._setting("evaluation_seeds", 1), 1),
+            months=None if months is None else count(self.where, "months", months, 1),
+            evaluation_seeds=count(self.where, "evaluation_seeds", self._setting("evaluation_seeds", 1), 1),
             training=training,
         )
 
@@ -260,61 +271,61 @@ class _Group:
         changes = self._changes(algorithm)
         budget = self._setting("budget", None)
         if budget is not None:
-            changes["total_timesteps"] = _count(self.where, "budget", budget, 1)
+            changes["total_timesteps"] = count(self.where, "budget", budget, 1)
         preset = self._setting("preset", "default")
-        validations = _count(self.where, "validations", self._setting("validations", DEFAULT_VALIDATIONS), 1)
+        validations = count(self.where, "validations", self._setting("validations", DEFAULT_VALIDATIONS), 1)
         return Training(algorithm, seed, preset, changes, validations)
 
     def _changes(self, algorithm: str) -> dict[str, Any]:
         """Hyperparameters of the group: those of all its algorithms, then those of this one."""
-        table = _table(self.where, self.table, "hyperparameters")
+        table = table_of(self.where, self.table, "hyperparameters")
         common = {name: value for name, value in table.items() if name not in runs.ALGORITHMS}
-        merged = {**common, **_as_table(f"{self.where}, hyperparameters.{algorithm}", table.get(algorithm, {}))}
-        return _with_tuples(merged)
+        merged = {**common, **as_table(f"{self.where}, hyperparameters.{algorithm}", table.get(algorithm, {}))}
+        return with_tuples(merged)
 
     def _check_hyperparameters(self, algorithms: Sequence[str]) -> None:
-        for name, value in _table(self.where, self.table, "hyperparameters").items():
+        for name, value in table_of(self.where, self.table, "hyperparameters").items():
             if name in runs.ALGORITHMS and name not in algorithms:
-                raise UsageError(f"{_upper(self.where)} has hyperparameters of {name}, which it does not train.")
+                raise UsageError(f"{upper(self.where)} has hyperparameters of {name}, which it does not train.")
             if isinstance(value, dict) and name not in runs.ALGORITHMS:
-                raise _unknown(f"{_upper(self.where)}: hyperparameters of", name, algorithms)
+                raise unknown(f"{upper(self.where)}: hyperparameters of", name, algorithms)
         for algorithm in algorithms:
             known = {field.name: field for field in fields(runs.ALGORITHMS[algorithm].args)}
             for name, value in self._changes(algorithm).items():
                 if name in ("seed", "total_timesteps"):
                     key = {"seed": "seeds", "total_timesteps": "budget"}[name]
-                    raise UsageError(f"{_upper(self.where)}: {name} is no hyperparameter of a study: give {key}.")
+                    raise UsageError(f"{upper(self.where)}: {name} is no hyperparameter of a study: give {key}.")
                 if name not in known:
-                    raise _unknown(f"{_upper(self.where)}: hyperparameter of {algorithm}", name, list(known))
-                _check_kind(f"{self.where}, hyperparameter {name}", value, known[name].default)
+                    raise unknown(f"{upper(self.where)}: hyperparameter of {algorithm}", name, list(known))
+                check_kind(f"{self.where}, hyperparameter {name}", value, known[name].default)
 
     def _check_agent(self, agent: str, task: str) -> None:
         kind = find_task(task).kind
         if _AGENT_KINDS.get(agent, kind) != kind:
             able = [other for other in AGENTS if _AGENT_KINDS.get(other, kind) == kind]
             raise UsageError(
-                f"{_upper(self.where)}: agent {agent!r} cannot play {task}, which has {_ACTIONS[kind]} actions: choose "
+                f"{upper(self.where)}: agent {agent!r} cannot play {task}, which has {_ACTIONS[kind]} actions: choose "
                 f"one of {', '.join(able)}."
             )
 
     def _environment(self, heuristic: str | None) -> dict[str, Any]:
-        table = _table(self.where, self.table, "environment")
+        table = table_of(self.where, self.table, "environment")
         allowed = [item.name for item in fields(TaskOptions) if item.name not in _GIVEN_OTHERWISE]
         for name in table:
             if name not in allowed:
-                raise _unknown(f"{_upper(self.where)}: environment keyword", name, allowed)
-        keywords = _with_tuples(table)
+                raise unknown(f"{upper(self.where)}: environment keyword", name, allowed)
+        keywords = with_tuples(table)
         try:
             TaskOptions(heuristic=heuristic, **keywords)
         except UsageError as error:
-            raise UsageError(f"{_upper(self.where)}: {error}") from None
+            raise UsageError(f"{upper(self.where)}: {error}") from None
         return keywords
 
     def _seeds(self) -> list[int]:
         seeds = self._setting("seeds", [1])
         if not isinstance(seeds, list) or not seeds:
-            raise UsageError(f"{_upper(self.where)}: seeds must be a list such as [1, 2, 3], not {seeds!r}.")
-        return [_count(self.where, "each of seeds", seed, 0) for seed in seeds]
+            raise UsageError(f"{upper(self.where)}: seeds must be a list such as [1, 2, 3], not {seeds!r}.")
+        return [count(self.where, "each of seeds", seed, 0) for seed in seeds]
 
     def _setting(self, key: str, default: Any) -> Any:
         """The group's value, else the scale's, else the study's; the group may give one per scale."""
@@ -322,7 +333,7 @@ class _Group:
         if isinstance(own, dict):
             for name in own:
                 if name not in self.scales:
-                    raise _unknown(f"{_upper(self.where)}: scale", name, self.scales)
+                    raise unknown(f"{upper(self.where)}: scale", name, self.scales)
             own = own.get(self.scale or "")
         return next(
             (value for value in (own, *(table.get(key) for table in self.shared)) if value is not None), default
@@ -331,19 +342,14 @@ class _Group:
     def _names(self, key: str, allowed: Sequence[str] | Mapping[str, Any] | None = None) -> list[str]:
         names = self.table.get(key, [])
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-            raise UsageError(f"{_upper(self.where)}: {key} must be a list of names in quotation marks, not {names!r}.")
+            raise UsageError(f"{upper(self.where)}: {key} must be a list of names in quotation marks, not {names!r}.")
         for name in names:
             if allowed is not None and name not in allowed:
-                raise _unknown(f"{_upper(self.where)}: {key.removesuffix('s')}", name, list(allowed))
+                raise unknown(f"{upper(self.where)}: {key.removesuffix('s')}", name, list(allowed))
         return names
 
 
 _GIVEN_OTHERWISE = ("heuristic", "split", "scenario", "gamma")
-
-
-def _with_tuples(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Values read from TOML or JSON, where tuples are lists."""
-    return {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
 
 
 def _chosen_scale(scales: Mapping[str, Any], asked: str | None) -> str | None:
@@ -352,7 +358,7 @@ def _chosen_scale(scales: Mapping[str, Any], asked: str | None) -> str | None:
     if not scales:
         raise UsageError(f"Scale {asked!r} does not exist: this study has no scales, leave --scale out.")
     if asked not in scales:
-        raise _unknown("Scale", asked, list(scales))
+        raise unknown("Scale", asked, list(scales))
     return asked
 
 
@@ -362,55 +368,3 @@ def _refuse_equal_names(cells: Sequence[Cell]) -> None:
         if cell.name in seen:
             raise UsageError(f"Cell {cell.name} is listed twice: take it out of one group, or give one group a label.")
         seen.add(cell.name)
-
-
-def _check_kind(what: str, value: Any, default: Any) -> None:
-    """Refuse a value that is not of the kind of the default (None says nothing about its kind)."""
-    numbers = (int, float)
-    if default is None or type(value) is type(default):
-        return
-    if isinstance(default, float) and isinstance(value, numbers) and not isinstance(value, bool):
-        return
-    kind = {bool: "true or false", int: "a whole number", float: "a number", tuple: "a list", str: "a text"}
-    raise UsageError(f"{_upper(what)} must be {kind.get(type(default), type(default).__name__)}, not {value!r}.")
-
-
-def _refuse_unknown_keys(where: str, table: Mapping[str, Any], allowed: Sequence[str]) -> None:
-    for key in table:
-        if key not in allowed:
-            raise _unknown(f"Key of {where},", key, allowed)
-
-
-def _text(where: str, table: Mapping[str, Any], key: str, default: str | None = None) -> str:
-    value = table.get(key, default)
-    if not isinstance(value, str) or (not value and default is None):
-        raise UsageError(f"{_upper(where)} needs {key}, a text in quotation marks.")
-    if key in ("name", "label") and not all(letter.isalnum() or letter in "-_." for letter in value):
-        raise UsageError(f"{_upper(where)}: {key} may contain letters, digits, '-', '_' and '.', unlike {value!r}.")
-    return value
-
-
-def _table(where: str, table: Mapping[str, Any], key: str) -> dict[str, Any]:
-    return _as_table(f"{where}, {key}", table.get(key, {}))
-
-
-def _as_table(what: str, value: Any) -> dict[str, Any]:
-    if not isinstance(value, dict):
-        raise UsageError(f"{_upper(what)} must be a table, not {value!r}.")
-    return value
-
-
-def _count(where: str, key: str, value: Any, at_least: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or value < at_least:
-        raise UsageError(f"{_upper(where)}: {key} must be a whole number of at least {at_least}, not {value!r}.")
-    return value
-
-
-def _unknown(what: str, value: object, allowed: Sequence[str]) -> UsageError:
-    close = difflib.get_close_matches(str(value), list(allowed), n=1)
-    hint = f" (did you mean {close[0]!r}?)" if close else ""
-    return UsageError(f"{what} {value!r} does not exist{hint}: choose one of {', '.join(allowed)}.")
-
-
-def _upper(text: str) -> str:
-    return text[:1].upper() + text[1:]

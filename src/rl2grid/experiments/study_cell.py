@@ -14,7 +14,6 @@ gets a termination signal or when its standard input is closed, which happens wh
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import shlex
@@ -23,7 +22,7 @@ import subprocess
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -122,9 +121,14 @@ def run_cell(folder: Path) -> None:
     Raises:
         UsageError: what is asked for cannot be done.
         KeyboardInterrupt: a signal asked to stop; calling this again goes on.
+        filelock.Timeout: another process works on it.
     """
-    if read_result(folder) is not None:
-        return
+    with FileLock(folder / LOCK_FILE).acquire(timeout=0):
+        if read_result(folder) is None:
+            _finish(folder)
+
+
+def _finish(folder: Path) -> None:
     cell = cell_from_dict(_read_json(folder / CELL_FILE))
     agent: str | Path = cell.agent
     if cell.training is not None:
@@ -220,13 +224,12 @@ def work(folder: Path, command: Sequence[str] = COMMAND) -> int:
         raise
 
 
-def serve(folder: Path, do: Callable[[Path], None] = run_cell) -> int:
-    """Work on a cell in this process; returns the exit status."""
+def serve(do: Callable[[], None]) -> int:
+    """Do something until it is done, or until a signal or the end of the standard input; returns the exit status."""
     try:
         signal.signal(signal.SIGTERM, _interrupt)
         threading.Thread(target=_stop_when_input_ends, daemon=True).start()
-        with _locked(folder):
-            do(folder)
+        do()
     except Timeout:
         return BUSY
     except KeyboardInterrupt:
@@ -287,12 +290,6 @@ def _read_json(path: Path) -> Any:
         raise UsageError(f"{path} cannot be read as part of a study: {error}.") from None
 
 
-@contextlib.contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    with FileLock(folder / LOCK_FILE).acquire(timeout=0):
-        yield
-
-
 def _interrupt(number: int, frame: object) -> None:
     raise KeyboardInterrupt
 
@@ -305,4 +302,4 @@ def _stop_when_input_ends() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(serve(Path(sys.argv[1])))
+    sys.exit(serve(lambda: run_cell(Path(sys.argv[1]))))

@@ -12,8 +12,6 @@ from __future__ import annotations
 
 import json
 import os
-import signal
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -29,6 +27,7 @@ from rich.table import Table
 
 from rl2grid.analysis.episodes import COLUMNS, EPISODES_FILE, format_row, read_episodes
 from rl2grid.analysis.training import VALIDATION
+from rl2grid.experiments.interrupts import stop_requests
 from rl2grid.experiments.study import Cell, Study
 from rl2grid.experiments.study_backends import Backend, Job
 from rl2grid.experiments.study_cell import (
@@ -167,7 +166,7 @@ def run_study(study: Study, backend: Backend, console: Console | None = None) ->
     for cell in study.cells:
         prepare(study.folder(cell), cell)
     runner = _Runner(study, backend)
-    with _stop_requests() as stop, _display(console) as show:
+    with stop_requests() as stop, _display(console) as show:
         while not stop.is_set() and runner.step():
             show(lambda: study_table(study, runner.states, runner.remaining_seconds()))
             stop.wait(_POLL_SECONDS)
@@ -354,31 +353,6 @@ def _duration(seconds: float) -> str:
         return f"{max(minutes, 1)} min"
     hours, minutes = divmod(minutes, 60)
     return f"{hours} h {minutes:02d} min" if hours < 48 else f"{hours / 24:.0f} days"
-
-
-@contextmanager
-def _stop_requests() -> Iterator[threading.Event]:
-    """An event set by the first interrupt or termination signal; the second one has its usual effect."""
-    stop = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield stop
-        return
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-
-    def restore() -> None:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-    def request(number: int, frame: object) -> None:
-        stop.set()
-        restore()
-
-    for number in before:
-        signal.signal(number, request)
-    try:
-        yield stop
-    finally:
-        restore()
 
 
 @contextmanager
