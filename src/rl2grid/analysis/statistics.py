@@ -118,7 +118,7 @@ def share_above(thresholds: ArrayLike) -> Aggregate:
         flat = np.sort(scores.reshape(*scores.shape[:-2], -1), axis=-1)
         rows = flat.reshape(-1, flat.shape[-1])
         above = np.stack([row.size - np.searchsorted(row, levels, side="right") for row in rows])
-        return above.reshape(*flat.shape[:-1], len(levels)) / flat.shape[-1]
+        return np.asarray(above.reshape(*flat.shape[:-1], len(levels)) / flat.shape[-1])
 
     return share
 

@@ -95,7 +95,8 @@ def intervals(flags: NDArray[np.bool_]) -> list[list[int]]:
     turns = np.diff(np.concatenate((edge, flags.astype(np.int8), edge)), axis=0)
     begin_line, begin = np.nonzero((turns == 1).T)
     _, end = np.nonzero((turns == -1).T)
-    return np.stack((begin_line, begin, end), axis=1).tolist()
+    rows: list[list[int]] = np.stack((begin_line, begin, end), axis=1).tolist()
+    return rows
 
 
 def _grid_data(grid: Grid) -> dict[str, Any]:

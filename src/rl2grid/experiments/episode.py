@@ -117,7 +117,9 @@ def play_episode(
         illegal=illegal,
         ambiguous=ambiguous,
         wall_time_s=round(time.perf_counter() - began, 4),
-        **ending._asdict(),
+        last_overloads=ending.last_overloads,
+        last_outages=ending.last_outages,
+        last_cut_off=ending.last_cut_off,
         **totals,
     )
 
