@@ -9,7 +9,7 @@ import numpy as np
 from rl2grid.analysis.episodes import Episode
 from rl2grid.analysis.recordings import Recording
 from rl2grid.analysis.results import EvaluationResult
-from rl2grid.analysis.training import TrainingCurve
+from rl2grid.analysis.training import Metric, TrainingCurve
 
 TASK = "rl2grid/bus14-T0-v0"
 
@@ -66,11 +66,24 @@ def result(agent: str, survivals: list[list[float]], heuristic: str | None = Non
 
 
 def curve(label: str = "ppo", seed: int = 0, n: int = 30) -> TrainingCurve:
+    """Survival, a score and a cost of ``n`` iterations with 300 episodes each."""
+    random = np.random.default_rng(seed)
     decisions = 100.0 * np.arange(1, n + 1)
-    survival = np.clip(decisions / 3000 + np.random.default_rng(seed).normal(0, 0.1, n), 0, 1)
-    validated = slice(9, None, 10)
+    survival = np.clip(decisions / 3000 + random.normal(0, 0.1, n), 0, 1)
+    score, cost = random.normal(11, 1, n), random.uniform(0, 100, n)
+
+    def metric(values: Any, points: slice = slice(None)) -> Metric:
+        return Metric(decisions[points], 12 * decisions[points], values[points], np.full(n, 300.0)[points])
+
+    validated = metric(survival, slice(9, None, 10))
     return TrainingCurve(
-        label, decisions, 12 * decisions, survival, decisions[validated], 12 * decisions[validated], survival[validated]
+        label,
+        {
+            "charts/survival": metric(survival),
+            "charts/score_margin": metric(score),
+            "charts/cost_tlo": metric(cost),
+            "validation/survival": validated,
+        },
     )
 
 

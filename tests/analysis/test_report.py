@@ -57,7 +57,7 @@ def test_one_run_shows_its_points_and_several_their_mean():
     assert line.get_label() == "ppo (4 runs)"
     assert line.get_xdata()[-1] == pytest.approx(36_000)
     (validation,) = [line for line in several.lines if line.get_marker() == "D"]
-    expected = np.mean([curve(seed=k).validation_survival for k in range(4)], axis=0)
+    expected = np.mean([curve(seed=k).validation.values for k in range(4)], axis=0)
     np.testing.assert_allclose(validation.get_ydata(), expected)
 
 

@@ -136,9 +136,11 @@ def test_recordings_survive_a_file(tmp_path):
 
 METRICS = """step,grid_steps,wall_time,name,value
 100,1200,1.0,charts/survival,0.25
+100,1200,1.0,charts/episodes,20
 100,1200,1.0,losses/value,3.0
 200,2500,2.0,charts/survival,nan
 300,3500,3.0,charts/survival,0.5
+300,3500,3.0,charts/episodes,40
 300,3500,3.0,validation/survival,0.75
 """
 
@@ -146,11 +148,12 @@ METRICS = """step,grid_steps,wall_time,name,value
 def test_a_training_curve_is_what_the_run_wrote(tmp_path):
     (tmp_path / "metrics.csv").write_text(METRICS)
     curve = read_training_curve(tmp_path, "ppo")
-    np.testing.assert_array_equal(curve.decisions, [100, 300])
-    np.testing.assert_array_equal(curve.grid_steps, [1200, 3500])
-    np.testing.assert_array_equal(curve.survival, [0.25, 0.5])
-    np.testing.assert_array_equal(curve.validation_decisions, [300])
-    np.testing.assert_array_equal(curve.validation_survival, [0.75])
+    np.testing.assert_array_equal(curve.survival.decisions, [100, 300])
+    np.testing.assert_array_equal(curve.survival.grid_steps, [1200, 3500])
+    np.testing.assert_array_equal(curve.survival.values, [0.25, 0.5])
+    np.testing.assert_array_equal(curve.survival.episodes, [20, 40])
+    np.testing.assert_array_equal(curve.validation.decisions, [300])
+    np.testing.assert_array_equal(curve.validation.values, [0.75])
 
 
 def test_a_run_without_episodes_has_no_curve(tmp_path):

@@ -11,7 +11,6 @@ from rl2grid.analysis.statistics import (
     interquartile_mean,
     mean,
     stratified_bootstrap,
-    trailing_mean,
 )
 
 
@@ -88,22 +87,3 @@ def test_a_band_is_the_bootstrap_at_every_point():
     for point in range(4):
         expected = stratified_bootstrap(curves[:, point])
         assert (average[point], low[point], high[point]) == pytest.approx((expected.value, expected.low, expected.high))
-
-
-def test_trailing_mean_by_hand():
-    average, low, high = trailing_mean([1.0, 3.0, 5.0, 1.0], 2)
-    np.testing.assert_allclose(average, [1.0, 2.0, 4.0, 3.0])
-    half = 1.959964 * np.sqrt(np.array([0.0, 2.0, 2.0, 8.0]) / [1, 2, 2, 2])
-    np.testing.assert_allclose(high - average, half, rtol=1e-6)
-    np.testing.assert_allclose(average - low, half, rtol=1e-6)
-
-
-def test_trailing_mean_of_large_equal_numbers_has_no_width():
-    average, low, high = trailing_mean(np.full(50, 1e9 + 0.1), 10)
-    np.testing.assert_array_equal(average, 1e9 + 0.1)
-    np.testing.assert_array_equal(low, high)
-
-
-def test_a_window_of_nothing_is_refused():
-    with pytest.raises(ValueError, match="at least one"):
-        trailing_mean([1.0], 0)

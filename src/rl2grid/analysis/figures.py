@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import itertools
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +20,14 @@ from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.text import Annotation
 from matplotlib.ticker import FuncFormatter, PercentFormatter
 from numpy.typing import NDArray
 
 from rl2grid.analysis.recordings import Recording
 from rl2grid.analysis.results import EvaluationResult
-from rl2grid.analysis.statistics import Floats, bootstrap_band, trailing_mean
-from rl2grid.analysis.training import TrainingCurve
+from rl2grid.analysis.statistics import Floats, bootstrap_band, episode_mean
+from rl2grid.analysis.training import SURVIVAL, Metric, TrainingCurve
 from rl2grid.drawing.theme import (
     FULL_SCALE,
     GREEN,
@@ -45,8 +46,8 @@ MAX_COLUMNS = 360
 step is wide enough to be seen."""
 MAX_LABELS = 40
 CURVE_POINTS = 200
-SMOOTHING_SHARE = 20
-"""Curves are smoothed over one part in this many of their points."""
+SMOOTHED_EPISODES = 500
+"""Episodes over which training curves are smoothed (paper, Section 5)."""
 
 
 def training_curves(
@@ -54,9 +55,8 @@ def training_curves(
 ) -> Figure:
     """Survival of training episodes against the budget; runs with one label are one line.
 
-    One run shows its trailing mean with the 95% interval of that mean, over points that stay visible.
-    Several runs show the mean of their trailing means with a 95% bootstrap interval over runs. Diamonds are
-    validation.
+    Means over the last :data:`SMOOTHED_EPISODES` episodes (paper, Section 5): one run over points that stay
+    visible, several runs as their mean with a 95% bootstrap interval over runs. Diamonds are validation.
 
     Args:
         curves: at least one; see :func:`rl2grid.analysis.training.read_training_curve`.
@@ -67,22 +67,58 @@ def training_curves(
     with matplotlib.rc_context(style(theme)):
         figure = Figure(figsize=(6.4, 3.6), layout="constrained")
         axes = figure.subplots()
-        labels = list(dict.fromkeys(curve.label for curve in curves))
-        for label, colour in zip(labels, itertools.cycle(theme.series), strict=False):
-            runs = [curve for curve in curves if curve.label == label]
-            _draw_curve(axes, label, runs, x, colour)
-            _draw_validation(axes, runs, x, colour, theme)
-        axes.set(xlabel="Decisions" if x == "decisions" else "Grid steps", ylim=(0, 1.03))
-        axes.set_xlim(left=0)
-        axes.xaxis.set_major_formatter(FuncFormatter(_thousands))
+        draw_metric(axes, curves, SURVIVAL, x=x, theme=theme)
+        draw_validation(axes, curves, x=x, theme=theme)
+        axes.set_ylim(0, 1.03)
         axes.yaxis.set_major_formatter(PercentFormatter(1.0))
-        axes.grid(axis="y")
-        _headline(axes, title, "share of the episode survived; band: 95% interval of the smoothed mean")
+        _headline(axes, title, training_sentence(curves, "share of the episode survived"))
         handles, _ = axes.get_legend_handles_labels()
-        if any(curve.validation_survival.size for curve in curves):
+        if any(curve.validation for curve in curves):
             handles.append(_marker("D", theme.text, "validation"))
         axes.legend(handles=handles, loc="lower right")
     return figure
+
+
+def draw_metric(
+    axes: Axes, curves: Sequence[TrainingCurve], metric: str, *, x: str = "decisions", theme: Theme = LIGHT
+) -> None:
+    """A metric of training episodes against the budget, on axes that may hold others; see :func:`training_curves`."""
+    for label, runs, colour in labelled_runs(curves, theme):
+        logged = [run.metrics[metric] for run in runs if metric in run.metrics]
+        if logged:
+            name = label if len(logged) == 1 else f"{label} ({len(logged)} runs)"
+            _draw_runs(axes, name, logged, x, colour)
+    axes.set_xlabel("Decisions" if x == "decisions" else "Grid steps")
+    axes.set_xlim(left=0)
+    axes.xaxis.set_major_formatter(FuncFormatter(_thousands))
+    axes.grid(axis="y")
+
+
+def draw_validation(axes: Axes, curves: Sequence[TrainingCurve], *, x: str = "decisions", theme: Theme = LIGHT) -> None:
+    """Survival on the validation scenarios: mean over runs, at the points of the run with the fewest."""
+    for _, runs, colour in labelled_runs(curves, theme):
+        validated = [(getattr(run.validation, x), run.validation.values) for run in runs if run.validation]
+        if not validated:
+            continue
+        position = min((budget for budget, _ in validated), key=len)
+        survival = np.mean([np.interp(position, *points) for points in validated], axis=0)
+        axes.plot(position, survival, "D", color=colour, markersize=5.5, markeredgecolor=theme.background, zorder=4)
+
+
+def labelled_runs(
+    curves: Sequence[TrainingCurve], theme: Theme
+) -> Iterator[tuple[str, tuple[TrainingCurve, ...], str]]:
+    """Runs by label, in order of appearance, each with its colour."""
+    labels = dict.fromkeys(curve.label for curve in curves)
+    for label, colour in zip(labels, itertools.cycle(theme.series), strict=False):
+        yield label, tuple(curve for curve in curves if curve.label == label), colour
+
+
+def training_sentence(curves: Sequence[TrainingCurve], measure: str) -> str:
+    """What is drawn of ``measure``, in words."""
+    several = len({curve.label for curve in curves}) < len(curves)
+    band = "; band: 95% interval over runs" if several else ""
+    return f"{measure}, mean over {SMOOTHED_EPISODES} episodes{band}"
 
 
 def survival_by_agent(
@@ -166,33 +202,18 @@ def _render(figure: Figure, suffix: str) -> bytes:
     return file.getvalue()
 
 
-def _draw_curve(axes: Axes, label: str, runs: Sequence[TrainingCurve], x: str, colour: str) -> None:
+def _draw_runs(axes: Axes, label: str, runs: Sequence[Metric], x: str, colour: str) -> None:
     budgets = [np.asarray(getattr(run, x), np.float64) for run in runs]
-    smoothed = [trailing_mean(run.survival, max(1, len(run.survival) // SMOOTHING_SHARE)) for run in runs]
+    smoothed = [episode_mean(run.values, run.episodes, SMOOTHED_EPISODES) for run in runs]
     if len(runs) == 1:
-        position, (average, low, high) = budgets[0], smoothed[0]
-        axes.plot(position, runs[0].survival, ".", color=colour, alpha=0.35, markersize=4, markeredgewidth=0)
-    else:
-        last = min(budget[-1] for budget in budgets)
-        position = np.linspace(max(budget[0] for budget in budgets), last, CURVE_POINTS)
-        curves = [np.interp(position, budget, line[0]) for budget, line in zip(budgets, smoothed, strict=True)]
-        average, low, high = bootstrap_band(curves)
-    axes.fill_between(position, np.clip(low, 0, 1), np.clip(high, 0, 1), color=colour, alpha=0.2, linewidth=0)
-    axes.plot(
-        position, average, color=colour, linewidth=2, label=label if len(runs) == 1 else f"{label} ({len(runs)} runs)"
-    )
-
-
-def _draw_validation(axes: Axes, runs: Sequence[TrainingCurve], x: str, colour: str, theme: Theme) -> None:
-    """Mean over runs, at the points of the run with the fewest."""
-    validated = [
-        (getattr(run, f"validation_{x}"), run.validation_survival) for run in runs if run.validation_survival.size
-    ]
-    if not validated:
+        axes.plot(budgets[0], runs[0].values, ".", color=colour, alpha=0.25, markersize=3, markeredgewidth=0)
+        axes.plot(budgets[0], smoothed[0], color=colour, linewidth=2, label=label)
         return
-    position = min((budget for budget, _ in validated), key=len)
-    survival = np.mean([np.interp(position, *points) for points in validated], axis=0)
-    axes.plot(position, survival, "D", color=colour, markersize=5.5, markeredgecolor=theme.background, zorder=4)
+    position = np.linspace(max(budget[0] for budget in budgets), min(budget[-1] for budget in budgets), CURVE_POINTS)
+    lines = [np.interp(position, budget, line) for budget, line in zip(budgets, smoothed, strict=True)]
+    average, low, high = bootstrap_band(lines)
+    axes.fill_between(position, low, high, color=colour, alpha=0.2, linewidth=0)
+    axes.plot(position, average, color=colour, linewidth=2, label=label)
 
 
 def _draw_agent(axes: Axes, row: int, result: EvaluationResult, colour: str, theme: Theme) -> None:
@@ -353,6 +374,17 @@ def _headline(axes: Axes, title: str, sentence: str) -> None:
         fontsize=11,
         fontweight="bold",
     )
+
+
+def headline_of_panels(figure: Figure, title: str, sentence: str) -> None:
+    """Headline and sentence above several panels, whose widths they leave alone."""
+    words = figure.suptitle(f"{title}\n", x=0.012, ha="left", fontsize=11, fontweight="bold")
+    note = Annotation(
+        sentence, (0, 0), xycoords=words, xytext=(0, 4), textcoords="offset points", fontsize=8,
+        color=matplotlib.rcParams["xtick.color"],
+    )  # fmt: skip
+    note.set_in_layout(False)
+    figure.add_artist(note)
 
 
 def _thousands(value: float, _: int | None) -> str:

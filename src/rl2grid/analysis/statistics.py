@@ -12,7 +12,6 @@ from __future__ import annotations
 import enum
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from statistics import NormalDist
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -71,14 +70,14 @@ class Scores:
     @property
     def by_scenario(self) -> Floats:
         """float64 [scenario, repetition], run by run."""
-        return np.moveaxis(self.values, 0, 1).reshape(self.values.shape[1], -1)
+        return np.asarray(np.moveaxis(self.values, 0, 1).reshape(self.values.shape[1], -1))
 
     def resampled(self, unit: Unit, resamples: int = RESAMPLES, seed: int = 0) -> Floats:
         """float64 [resample, scenario, repetition], ``unit`` drawn with replacement."""
         runs, scenarios, seeds = self.values.shape
         if unit is Unit.RUN:
             drawn = self.values[_draw([np.arange(runs)], resamples, seed)]
-            return np.moveaxis(drawn, 1, 2).reshape(resamples, scenarios, runs * seeds)
+            return np.asarray(np.moveaxis(drawn, 1, 2).reshape(resamples, scenarios, runs * seeds))
         if unit is Unit.SCENARIO:
             return np.asarray(self.by_scenario[_draw([np.arange(scenarios)], resamples, seed)])
         flat = self.by_scenario.reshape(-1)
@@ -254,33 +253,6 @@ def bootstrap_band(
     return results.mean(axis=0), low, high
 
 
-def trailing_mean(values: ArrayLike, window: int, *, level: float = LEVEL) -> tuple[Floats, Floats, Floats]:
-    """Mean of the last ``window`` values at each point, with the normal interval of that mean.
-
-    The first points use what there is; a point with one value has an interval without width.
-
-    Args:
-        values: [point], in order.
-        window: number of values averaged, at least 1.
-        level: coverage of the interval.
-
-    Returns:
-        Mean, low and high, float64 [point] each.
-    """
-    if window < 1:
-        raise ValueError(f"The window must hold at least one value, got {window}.")
-    results = np.asarray(values, dtype=np.float64)
-    count = np.minimum(np.arange(1, len(results) + 1), window)
-    # Centred first: sums of squares of large, nearly equal numbers would cancel.
-    centre = results.mean() if len(results) else 0.0
-    average = _window_sum(results - centre, window) / count
-    square = _window_sum((results - centre) ** 2, window) / count
-    variance = np.maximum(square - average**2, 0.0) * count / np.maximum(count - 1, 1)
-    half = NormalDist().inv_cdf((1 + level) / 2) * np.sqrt(variance / count)
-    average = average + centre
-    return average, average - half, average + half
-
-
 def episode_mean(values: ArrayLike, episodes: ArrayLike, window: int) -> Floats:
     """Mean over the last ``window`` episodes at each point of a curve whose points are means over several.
 
@@ -300,12 +272,6 @@ def episode_mean(values: ArrayLike, episodes: ArrayLike, window: int) -> Floats:
     # Episodes of one point are told apart by nothing: the window cuts through them in proportion.
     first = np.maximum(ended[1:] - window, 0.0)
     return np.asarray((total[1:] - np.interp(first, ended, total)) / (ended[1:] - first))
-
-
-def _window_sum(values: Floats, window: int) -> Floats:
-    total = np.concatenate(([0.0], np.cumsum(values)))
-    end = np.arange(1, len(values) + 1)
-    return np.asarray(total[end] - total[np.maximum(end - window, 0)])
 
 
 def _members(strata: Sequence[object] | None, n: int) -> list[NDArray[np.int64]]:

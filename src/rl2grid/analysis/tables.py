@@ -1,14 +1,119 @@
-"""Tables of results, for the terminal and as Markdown."""
+"""Tables of results: for the terminal, and as Markdown, LaTeX (booktabs) and CSV."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import csv
+import io
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import rich.box
 from rich.table import Table
 
 from rl2grid.analysis.statistics import Estimate
 from rl2grid.analysis.summary import Summary
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table."""
+
+    heading: str
+    group: str = ""
+    """Heading that it shares with its neighbours of the same group."""
+    words: bool = False
+    """Whether it holds words, which are aligned to the left, and not numbers."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A cell of a table: how it is printed, and the number behind it."""
+
+    text: str
+    estimate: Estimate | None = None
+    """All digits of the value and its interval, for CSV."""
+    best: bool = False
+    """Printed bold."""
+
+
+@dataclass(frozen=True)
+class ResultTable:
+    """A table, before it is written in one of :data:`WRITERS`."""
+
+    name: str
+    """Of its files, and of its label in LaTeX."""
+    caption: str
+    columns: tuple[Column, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+    """Each with one cell per column."""
+
+    def __post_init__(self) -> None:
+        for row in self.rows:
+            if len(row) != len(self.columns):
+                raise ValueError(f"A row of {self.name} has {len(row)} cells, the table {len(self.columns)} columns.")
+
+
+MISSING = Cell("-")
+
+
+def mean_cell(estimate: Estimate, *, digits: int = 2, best: bool = False) -> Cell:
+    """A value and half the width of its interval, as "0.97 ± 0.02"."""
+    half = (estimate.high - estimate.low) / 2
+    return Cell(f"{estimate.value:,.{digits}f} ± {half:,.{digits}f}", estimate, best)
+
+
+def interval_cell(estimate: Estimate, *, digits: int = 3, best: bool = False) -> Cell:
+    """A value and both ends of its interval, as "0.970 [0.950, 0.990]"."""
+    return Cell(_with_interval(estimate, digits), estimate, best)
+
+
+def table_markdown(table: ResultTable) -> str:
+    """A table as Markdown; a column of a group is headed "group heading"."""
+    headings = [f"{column.group} {column.heading}".strip() for column in table.columns]
+    lines = [_markdown_row(headings), _markdown_row([":--" if column.words else "--:" for column in table.columns])]
+    for row in table.rows:
+        lines.append(_markdown_row([f"**{cell.text}**" if cell.best else cell.text for cell in row]))
+    return "\n".join(lines) + f"\n\n{table.caption}\n"
+
+
+def table_latex(table: ResultTable) -> str:
+    """A table as LaTeX, in need of the package booktabs."""
+    letters = "".join("l" if column.words else "r" for column in table.columns)
+    lines = [r"\begin{table}", r"\centering", rf"\caption{{{_latex(table.caption)}}}", rf"\label{{tab:{table.name}}}"]
+    lines += [rf"\begin{{tabular}}{{{letters}}}", r"\toprule"]
+    if any(column.group for column in table.columns):
+        lines += _latex_groups(table.columns)
+    lines += [_latex_row([_latex(column.heading) for column in table.columns]), r"\midrule"]
+    for row in table.rows:
+        lines.append(_latex_row([rf"\textbf{{{_latex(c.text)}}}" if c.best else _latex(c.text) for c in row]))
+    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", r"\end{table}"]) + "\n"
+
+
+def table_csv(table: ResultTable) -> str:
+    """A table as CSV with all digits; a column of estimates becomes three: value, low and high."""
+    estimates = [any(row[k].estimate for row in table.rows) for k in range(len(table.columns))]
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    head: list[str] = []
+    for column, is_estimate in zip(table.columns, estimates, strict=True):
+        name = f"{column.group} {column.heading}".strip()
+        head += [name, f"{name} low", f"{name} high"] if is_estimate else [name]
+    writer.writerow(head)
+    for row in table.rows:
+        writer.writerow(
+            [
+                value
+                for cell, is_estimate in zip(row, estimates, strict=True)
+                for value in (_csv_numbers(cell) if is_estimate else [cell.text])
+            ]
+        )
+    return text.getvalue()
+
+
+WRITERS: dict[str, Callable[[ResultTable], str]] = {"md": table_markdown, "tex": table_latex, "csv": table_csv}
+"""Writer of each format, by the suffix of its files."""
+
 
 HEADINGS: tuple[str, ...] = (
     "agent",
@@ -101,6 +206,39 @@ def markdown_table(summaries: Sequence[Summary]) -> str:
 def is_best(summary: Summary, summaries: Sequence[Summary]) -> bool:
     """Whether no other agent survives longer on average; of one agent alone, nobody is best."""
     return len(summaries) > 1 and summary.survival.value == max(other.survival.value for other in summaries)
+
+
+def _latex_groups(columns: Sequence[Column]) -> list[str]:
+    """The row of the groups, and the rules below them."""
+    cells, rules, first = [], [], 1
+    for group, members in itertools.groupby(columns, key=lambda column: column.group):
+        n = len(list(members))
+        cells += [rf"\multicolumn{{{n}}}{{c}}{{{_latex(group)}}}"] if group else [""] * n
+        if group:
+            rules.append(rf"\cmidrule(lr){{{first}-{first + n - 1}}}")
+        first += n
+    return [_latex_row(cells), " ".join(rules)]
+
+
+def _latex_row(cells: Sequence[str]) -> str:
+    return " & ".join(cells) + r" \\"
+
+
+_LATEX = {
+    "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
+    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "±": r"$\pm$", "≤": r"$\le$", ">": r"$>$", "<": r"$<$",
+    "|": r"$|$",
+}  # fmt: skip
+
+
+def _latex(text: str) -> str:
+    return "".join(_LATEX.get(letter, letter) for letter in text)
+
+
+def _csv_numbers(cell: Cell) -> list[object]:
+    if cell.estimate is None:
+        return ["", "", ""]
+    return [cell.estimate.value, cell.estimate.low, cell.estimate.high]
 
 
 def _markdown_row(cells: Sequence[str]) -> str:

@@ -1,10 +1,13 @@
-"""What training runs say of themselves: their ``metrics.csv``."""
+"""What training runs say of themselves: their ``metrics.csv``, and of what task and method they are."""
 
 from __future__ import annotations
 
 import csv
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,20 +18,53 @@ Floats = NDArray[np.float64]
 
 SURVIVAL, VALIDATION = "charts/survival", "validation/survival"
 """Names of the metrics: mean over the episodes that ended in an iteration, and on the validation scenarios."""
+EPISODES = "charts/episodes"
+RUN_FILE, METRICS_FILE = "config.json", "metrics.csv"
 _COLUMNS = ("step", "grid_steps", "name", "value")
 
 
 @dataclass(frozen=True, eq=False)
-class TrainingCurve:
-    """Survival of one run against its budget, float64 [point] each."""
+class Metric:
+    """One figure of a run against its budget, float64 [point] each."""
 
-    label: str
     decisions: Floats
     grid_steps: Floats
-    survival: Floats
-    validation_decisions: Floats
-    validation_grid_steps: Floats
-    validation_survival: Floats
+    values: Floats
+    episodes: Floats
+    """Episodes that ended since the point before: what the value is the mean of, where it is of episodes."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingCurve:
+    """What one run logged."""
+
+    label: str
+    """What figures call the run; runs with one label are drawn as one line."""
+    metrics: Mapping[str, Metric]
+    """By name, such as :data:`SURVIVAL`, which is always there."""
+
+    @property
+    def survival(self) -> Metric:
+        """Of the episodes that ended in training."""
+        return self.metrics[SURVIVAL]
+
+    @property
+    def validation(self) -> Metric | None:
+        """Survival on the validation scenarios; None before the first validation."""
+        return self.metrics.get(VALIDATION)
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingRun:
+    """A run folder."""
+
+    folder: Path
+    task: str
+    """Id of the task."""
+    settings: Mapping[str, Any]
+    """Everything that the runs of one method have in common: all but the seed."""
+    seed: int
+    curve: TrainingCurve
 
 
 def read_training_curve(path: Path, label: str) -> TrainingCurve:
@@ -41,7 +77,7 @@ def read_training_curve(path: Path, label: str) -> TrainingCurve:
     Raises:
         UsageError: the file is missing, no metrics file, or no episode ended yet.
     """
-    path = path / "metrics.csv" if path.is_dir() else path
+    path = path / METRICS_FILE if path.is_dir() else path
     try:
         with path.open(encoding="utf-8", newline="") as file:
             rows = [[row[column] for column in _COLUMNS] for row in csv.DictReader(file)]
@@ -50,13 +86,80 @@ def read_training_curve(path: Path, label: str) -> TrainingCurve:
         raise UsageError(
             f"{path} is no metrics file of a training run: give a run folder or its metrics.csv."
         ) from None
-    training, validation = _points(points, SURVIVAL), _points(points, VALIDATION)
-    if not len(training):
+    metrics = _metrics(points)
+    if SURVIVAL not in metrics:
         raise UsageError(f"{path} has no survival yet: no episode has ended in training.")
-    return TrainingCurve(label, *training.T, *validation.T)
+    return TrainingCurve(label, metrics)
 
 
-def _points(points: list[tuple[str, float, float, float]], metric: str) -> Floats:
-    """Decisions, grid steps and finite values of a metric, float64 [point, 3]."""
-    chosen = [values for name, *values in points if name == metric and np.isfinite(values[-1])]
-    return np.array(chosen, np.float64).reshape(len(chosen), 3)
+def read_training_run(folder: Path, label: str | None = None) -> TrainingRun:
+    """A run, finished or still going on.
+
+    Args:
+        folder: the run folder.
+        label: what figures call it; None: its algorithm and heuristic.
+
+    Raises:
+        UsageError: the folder is no run, or one of its files is missing or not what it should be.
+    """
+    if not (folder / RUN_FILE).is_file():
+        raise UsageError(f"{folder} holds no run: give a folder that 'rl2grid train' wrote.")
+    try:
+        config = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
+        request, identity = config["request"], config["identity"]
+        hyperparameters = dict(request["hyperparameters"])
+        seed = int(hyperparameters.pop("seed"))
+        task, algorithm, keywords = request["task"], request["algorithm"], request["env_keywords"]
+        settings = {
+            **{key: value for key, value in identity.items() if key != "seed"},
+            **keywords,
+            **hyperparameters,
+            "algorithm": algorithm,
+        }
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UsageError(f"{folder / RUN_FILE} is no description of a run: {error!r}.") from None
+    heuristic = keywords.get("heuristic")
+    name = label or (f"{algorithm} + {heuristic}" if heuristic else algorithm)
+    return TrainingRun(folder, task, settings, seed, read_training_curve(folder, name))
+
+
+def group_curves(runs: Sequence[TrainingRun]) -> dict[str, dict[str, tuple[TrainingCurve, ...]]]:
+    """Curves by task, then label, both in order of appearance.
+
+    Raises:
+        UsageError: runs that one label stands for differ in more than their seed, or not even in that.
+    """
+    groups: dict[str, dict[str, list[TrainingRun]]] = {}
+    for run in runs:
+        groups.setdefault(run.task, {}).setdefault(run.curve.label, []).append(run)
+    for by_label in groups.values():
+        for label, group in by_label.items():
+            _check_one_method(label, group)
+    return {
+        task: {label: tuple(run.curve for run in group) for label, group in by_label.items()}
+        for task, by_label in groups.items()
+    }
+
+
+def _check_one_method(label: str, runs: Sequence[TrainingRun]) -> None:
+    first = runs[0]
+    for place, run in enumerate(runs[1:], start=1):
+        for key in sorted({*first.settings, *run.settings}):
+            mine, other = first.settings.get(key), run.settings.get(key)
+            if mine != other:
+                raise UsageError(
+                    f"Runs of different {key} do not belong into one curve: {first.folder} has {mine!r}, {run.folder} "
+                    f"has {other!r}; tell them apart as LABEL={run.folder}."
+                )
+        if run.seed in {earlier.seed for earlier in runs[:place]}:
+            raise UsageError(f"Two runs of {label} on {run.task} have seed {run.seed}: leave out {run.folder}.")
+
+
+def _metrics(points: list[tuple[str, float, float, float]]) -> dict[str, Metric]:
+    """Finite values of every metric."""
+    ended = {step: value for name, step, _, value in points if name == EPISODES}
+    rows: dict[str, list[tuple[float, float, float, float]]] = {}
+    for name, step, grid_steps, value in points:
+        if np.isfinite(value):
+            rows.setdefault(name, []).append((step, grid_steps, value, max(ended.get(step, 1.0), 1.0)))
+    return {name: Metric(*np.array(values, np.float64).T) for name, values in rows.items()}

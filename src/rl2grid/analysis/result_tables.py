@@ -1,0 +1,245 @@
+"""The tables of a results section, in the shapes of the paper (Tables 2 and 3) and beyond."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+
+from rl2grid.analysis.lifetimes import kaplan_meier, lifetimes, log_rank
+from rl2grid.analysis.methods import COSTS, Method
+from rl2grid.analysis.statistics import (
+    Aggregate,
+    estimate,
+    iqm_score,
+    mean_score,
+    median_score,
+    optimality_gap,
+    probability_of_improvement,
+)
+from rl2grid.analysis.tables import MISSING, Cell, Column, ResultTable, interval_cell, mean_cell
+from rl2grid.mdp.constraints import THRESHOLDS
+from rl2grid.mdp.termination import GAME_OVER_TEXT, GameOver
+
+HEURISTIC_LETTERS: dict[str, str] = {"none": "V", "idle": "I", "recovery": "R"}
+"""The paper's: vanilla, idle and recovery."""
+AGGREGATES: dict[str, Aggregate] = {
+    "mean": mean_score,
+    "median": median_score,
+    "IQM": iqm_score,
+    "optimality gap": optimality_gap,
+}
+"""Of survival."""
+SCORES: dict[str, str] = {"margin": "score_margin", "overload": "score_overload", "topology": "score_topology"}
+"""Columns of the operational scores (paper, Section 5)."""
+_BASELINES = "Baselines"
+_METHOD = (Column("Task", words=True), Column("Method", words=True))
+
+Methods = Mapping[str, Sequence[Method]]
+"""By task."""
+
+
+def result_tables(methods: Methods) -> tuple[ResultTable, ...]:
+    """Every table that the results allow."""
+    tables = [survival_table(methods, kind) for kind in ("T", "R") if _tasks(methods, kind)]
+    tables += [aggregate_table(methods), constraint_table(methods), score_table(methods), ending_table(methods)]
+    if any(len(group) > 1 for group in methods.values()):
+        tables.append(comparison_table(methods))
+    return tuple(tables)
+
+
+def survival_table(methods: Methods, kind: str) -> ResultTable:
+    """Mean survival by task, agent and heuristic (paper, Table 2 for topology tasks, Table 3 for continuous ones).
+
+    Args:
+        methods: by task.
+        kind: ``"T"`` or ``"R"``.
+    """
+    tasks = _tasks(methods, kind)
+    places = _places(itertools.chain.from_iterable(methods[task] for task in tasks))
+    columns = (
+        Column("Env.", words=True),
+        Column("Diff.", words=True),
+        *(Column(heading, group) for group, heading in places),
+    )
+    rows = []
+    for task in tasks:
+        means = {_place(method): estimate(method.scores("survival")) for method in methods[task]}
+        best = _printed_best([value.value for value in means.values()], 2)
+        first = methods[task][0].task
+        cells = [
+            mean_cell(means[place], best=round(means[place].value, 2) == best) if place in means else MISSING
+            for place in places
+        ]
+        name = first.grid_id + (f" {first.constraint}" if first.constraint else "")
+        rows.append((Cell(name), Cell(str(first.level)), *cells))
+    actions = "topology" if kind == "T" else "redispatch"
+    caption = (
+        f"Mean survival on tasks with {actions} actions (higher is better; best of a task in bold), plus or minus half "
+        f"of its 95% bootstrap interval over {_units(methods, tasks)}. V: vanilla, I: idle and R: recovery heuristic."
+    )
+    return ResultTable(f"survival-{actions}", caption, columns, tuple(rows))
+
+
+def aggregate_table(methods: Methods) -> ResultTable:
+    """Mean, median, interquartile mean and optimality gap of survival."""
+    columns = (*_METHOD, *(Column(name) for name in AGGREGATES))
+    rows = []
+    for group in methods.values():
+        values = [[estimate(method.scores("survival"), rule) for rule in AGGREGATES.values()] for method in group]
+        # The gap is what is missing: the least is best.
+        gap = list(AGGREGATES).index("optimality gap")
+        best = [
+            _printed_best([-e.value if k == gap else e.value for e in column], 3)
+            for k, column in enumerate(zip(*values, strict=True))
+        ]
+        for method, row in zip(group, values, strict=True):
+            cells = [
+                interval_cell(e, best=top is not None and round(e.value, 3) == abs(top))
+                for e, top in zip(row, best, strict=True)
+            ]
+            rows.append((*_names(method), *cells))
+    caption = (
+        f"Survival, with 95% bootstrap intervals over {_units(methods, methods)}. Median: over months, of a month's "
+        "mean; IQM: mean of the middle half of all episodes; optimality gap: what is missing to full survival."
+    )
+    return ResultTable("aggregates", caption, columns, tuple(rows))
+
+
+def constraint_table(methods: Methods) -> ResultTable:
+    """Survival, cost and its threshold, and how often an episode keeps the threshold and is completed."""
+    columns: tuple[Column, ...] = (*_METHOD, Column("Survival"))
+    for name, threshold in THRESHOLDS.items():
+        group = f"{name} (threshold {threshold:g})"
+        columns += (Column("cost", group), Column("P(kept)", group), Column("P(kept and completed)", group))
+    rows = []
+    for group_ in methods.values():
+        safe = {name: [estimate(method.safe(name)) for method in group_] for name in COSTS}
+        for k, method in enumerate(group_):
+            cells = [mean_cell(estimate(method.scores("survival")))]
+            for name, column in COSTS.items():
+                is_best = round(safe[name][k].value, 2) == _printed_best([e.value for e in safe[name]], 2)
+                cells += [
+                    mean_cell(estimate(method.scores(column)), digits=1),
+                    mean_cell(estimate(method.within(name))),
+                    mean_cell(safe[name][k], best=is_best),
+                ]
+            rows.append((*_names(method), *cells))
+    caption = (
+        "Costs of an episode and the share of episodes that keep the threshold, alone and together with being "
+        "completed: a grid that is lost early costs little, too. LSI: load shedding and islanding; TLO: overloaded and "
+        f"disconnected lines. Plus or minus half of the 95% bootstrap interval over {_units(methods, methods)}."
+    )
+    return ResultTable("constraints", caption, columns, tuple(rows))
+
+
+def score_table(methods: Methods) -> ResultTable:
+    """The operational scores (paper, Section 5)."""
+    columns = (*_METHOD, *(Column(name) for name in SCORES))
+    rows = [
+        (*_names(method), *(mean_cell(estimate(method.scores(column)), digits=3) for column in SCORES.values()))
+        for group in methods.values()
+        for method in group
+    ]
+    caption = (
+        "Operational scores, means per grid step. Margin: free capacity, summed over lines, -1 for one that is out; "
+        "overload: 0 without overloads and disconnections, down to -1; topology: minus the elements that are not on "
+        f"busbar 1. Plus or minus half of the 95% bootstrap interval over {_units(methods, methods)}."
+    )
+    return ResultTable("scores", caption, columns, tuple(rows))
+
+
+def ending_table(methods: Methods) -> ResultTable:
+    """How many episodes ended for each reason."""
+    everyone = [method for group in methods.values() for method in group]
+    reasons = [r for r in GameOver if r and any(e.game_over == r.name for m in everyone for e in m.episodes)]
+    columns = (*_METHOD, Column("episodes"), Column("completed"), *(Column(_short(reason)) for reason in reasons))
+    rows = []
+    for method in everyone:
+        endings = [episode.game_over for episode in method.episodes]
+        counts = [endings.count(reason.name) for reason in (GameOver.NONE, *reasons)]
+        rows.append((*_names(method), Cell(str(len(endings))), *(Cell(str(count)) for count in counts)))
+    caption = "How episodes ended. " + " ".join(f"{_short(r).capitalize()}: {GAME_OVER_TEXT[r]}." for r in reasons)
+    return ResultTable("endings", caption.strip(), columns, tuple(rows))
+
+
+def comparison_table(methods: Methods) -> ResultTable:
+    """Every pair of methods of a task: who improves on whom, and whether they live equally long."""
+    columns = (
+        Column("Task", words=True),
+        Column("X", words=True),
+        Column("Y", words=True),
+        Column("P(X > Y)"),
+        Column("median life of X, steps"),
+        Column("median life of Y, steps"),
+        Column("log-rank p"),
+    )
+    rows = []
+    for group in methods.values():
+        for x, y in itertools.combinations(group, 2):
+            improvement = probability_of_improvement(x.scores("survival"), y.scores("survival"))
+            lived = lifetimes(x.episodes), lifetimes(y.episodes)
+            medians = [Cell(_steps(kaplan_meier(one).median)) for one in lived]
+            p = log_rank(*lived)
+            names = (Cell(_task_name(x)), Cell(x.label), Cell(y.label))
+            rows.append((*names, interval_cell(improvement), *medians, Cell("< 0.0001" if p < 1e-4 else f"{p:.4f}")))
+    caption = (
+        "P(X > Y): how probably X survives longer than Y in the same month, ties counted half, with its 95% bootstrap "
+        "interval. Median life: grid steps after which half of the episodes are lost (Kaplan-Meier; a dash where more "
+        "than half are completed). Log-rank: p-value that both live equally long, not corrected for many pairs."
+    )
+    return ResultTable("comparisons", caption, columns, tuple(rows))
+
+
+def _printed_best(values: Sequence[float], digits: int) -> float | None:
+    """The highest value as printed: what looks equal is equally bold. None where all look equal."""
+    printed = {round(value, digits) for value in values}
+    return max(printed) if len(printed) > 1 else None
+
+
+def _tasks(methods: Methods, kind: str) -> list[str]:
+    return [task for task, group in methods.items() if group[0].task.kind == kind]
+
+
+def _places(methods: Iterable[Method]) -> list[tuple[str, str]]:
+    """Group and heading of the columns: baselines first, agents in order of appearance, heuristics in the paper's."""
+    letters = list(HEURISTIC_LETTERS.values())
+    seen: list[tuple[str, str]] = list(dict.fromkeys(_place(method) for method in methods))
+    groups = list(dict.fromkeys(group for group, _ in seen))
+    groups.sort(key=lambda group: group != _BASELINES)
+    ordered = []
+    for group in groups:
+        headings = [heading for other, heading in seen if other == group]
+        if group != _BASELINES:
+            headings.sort(key=letters.index)
+        ordered += [(group, heading) for heading in headings]
+    return ordered
+
+
+def _place(method: Method) -> tuple[str, str]:
+    if method.is_trained:
+        return method.agent.upper() if method.agent.islower() else method.agent, HEURISTIC_LETTERS[method.heuristic]
+    letter = "" if method.heuristic == "none" else f" ({HEURISTIC_LETTERS[method.heuristic]})"
+    return _BASELINES, f"{method.agent}{letter}"
+
+
+def _names(method: Method) -> tuple[Cell, Cell]:
+    return Cell(_task_name(method)), Cell(method.label)
+
+
+def _task_name(method: Method) -> str:
+    return method.task.id.removeprefix("rl2grid/").removesuffix("-v0")
+
+
+def _units(methods: Methods, tasks: Iterable[str]) -> str:
+    units = {method.scores("survival").unit.value for task in tasks for method in methods[task]}
+    return " or ".join(sorted(units))
+
+
+def _short(reason: GameOver) -> str:
+    return reason.name.replace("_", " ").lower()
+
+
+def _steps(value: float) -> str:
+    return MISSING.text if np.isnan(value) else f"{value:,.0f}"
