@@ -46,7 +46,14 @@ def test_a_run_folder_holds_everything_about_the_run(tmp_path: Path, algorithm: 
     asked = off_policy(tmp_path / "run", algorithm, task)
     folder = train(asked, evaluate=falling, make_envs=toy_envs)
     present = {path.name for path in folder.iterdir()} - {".lock"}
-    assert present == {"config.json", "metrics.csv", "checkpoint.pt", "best.pt", "log.txt"}  # no replay: it is finished
+    assert present == {
+        "config.json",
+        "metrics.csv",
+        "checkpoint.pt",
+        "best.pt",
+        "energy.json",
+        "log.txt",
+    }  # no replay: it is finished
     args, _ = read_config(folder)
     assert args.hyperparameters == asked.hyperparameters
     agent = load_agent(folder, task)

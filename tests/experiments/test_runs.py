@@ -101,7 +101,15 @@ def test_a_run_folder_holds_everything_about_the_run(tmp_path: Path):
     folder = train(request(tmp_path / "a" / "run", tensorboard=True), evaluate=falling, make_envs=toy_envs)
     assert folder == tmp_path / "a" / "run"
     present = {path.name for path in folder.iterdir()} - {".lock"}
-    assert present == {"config.json", "metrics.csv", "tensorboard", "checkpoint.pt", "best.pt", "log.txt"}
+    assert present == {
+        "config.json",
+        "metrics.csv",
+        "tensorboard",
+        "checkpoint.pt",
+        "best.pt",
+        "energy.json",
+        "log.txt",
+    }
     config = json.loads((folder / "config.json").read_text())
     assert config["identity"]["task"] == "rl2grid/bus14-T0-v0"
     assert config["identity"]["engine"] == "native"

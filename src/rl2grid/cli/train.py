@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from rl2grid.envs.tasks import TaskOptions, find_task
 from rl2grid.errors import UsageError, one_of
+from rl2grid.experiments.limits import TimeLimit
 
 if TYPE_CHECKING:
     from rl2grid.algorithms.policy_agent import PolicyAgent
@@ -22,7 +23,7 @@ INTERRUPTED = 130
 
 _HELP = """\
 usage: rl2grid train <algorithm> <task> [flags]
-       rl2grid train --resume <run folder>
+       rl2grid train --resume <run folder> [--max-minutes <minutes>]
 
 Trains an algorithm (ppo, lagrangian-ppo, dqn, sac, td3) on a task (see `rl2grid tasks`) and writes a run folder:
 configuration, metrics.csv, tensorboard/, checkpoint.pt, best.pt by validation, log.txt. A run that was
@@ -63,6 +64,20 @@ class TrainFlags:
     """Whether the best policy is picked on the validation scenarios."""
     checkpoint_seconds: float = 60.0
     """A checkpoint is written when the last one is older than this, and at the end."""
+    max_minutes: float | None = None
+    """Minutes after which the run stops with a checkpoint, to be resumed; None: no limit."""
+    track: bool = False
+    """Whether Weights & Biases gets the metrics; not before `wandb sync` with WANDB_MODE=offline."""
+    wandb_project: str = "rl2grid"
+    """The project that gets them."""
+
+
+@dataclass(frozen=True)
+class ResumeFlags:
+    """How a run goes on; all else is stored with it."""
+
+    max_minutes: float | None = None
+    """Minutes after which the run stops again with a checkpoint; None: no limit."""
 
 
 _ENV_KEYWORDS = ("constraint", "engine", "heuristic", "reward", "dispatch", "maintenance", "opponent")
@@ -86,13 +101,17 @@ def train(command_line: list[str]) -> int:
 
 
 def _resume(arguments: list[str]) -> int:
-    if len(arguments) != 1:
+    if not arguments or arguments[0].startswith("-"):
         raise UsageError("Resuming needs one run folder, for example `rl2grid train --resume runs/bus14-T0-v0-ppo-1`.")
     from rl2grid.experiments import runs
 
-    args, _ = runs.read_config(Path(arguments[0]))
-    folder = runs.resume(Path(arguments[0]), evaluate=_validator(args))
-    return _report(folder, args.task)
+    path, flags = Path(arguments[0]), arguments[1:]
+    _refuse_unknown(flags, [*fields(ResumeFlags)])
+    own = _parse("rl2grid train --resume", flags, ResumeFlags())
+    limit = TimeLimit(own.max_minutes)
+    args, _ = runs.read_config(path)
+    folder = runs.resume(path, evaluate=_validator(args), limit=limit)
+    return _report(folder, args.task, limit)
 
 
 def _begin(algorithm: str, task_id: str, flags: list[str]) -> int:
@@ -106,7 +125,8 @@ def _begin(algorithm: str, task_id: str, flags: list[str]) -> int:
     chosen = runs.ALGORITHMS[algorithm]
     hyperparameters = runs.hyperparameters(algorithm, task.id, _preset(flags))
     _refuse_unknown(flags, [*fields(TrainFlags), *fields(chosen.args)])
-    own, hyperparameters = _parse(f"rl2grid train {algorithm} {task.id}", flags, hyperparameters)
+    own, hyperparameters = _parse_both(f"rl2grid train {algorithm} {task.id}", flags, hyperparameters)
+    limit = TimeLimit(own.max_minutes)
     keywords = {name: getattr(own, name) for name in _ENV_KEYWORDS}
     TaskOptions(**keywords)
     args = runs.RunArgs(
@@ -119,14 +139,22 @@ def _begin(algorithm: str, task_id: str, flags: list[str]) -> int:
         num_workers=own.num_workers,
         checkpoint_seconds=own.checkpoint_seconds,
         evaluate_every=own.evaluate_every,
+        wandb_project=own.wandb_project if own.track else None,
     )
-    folder = runs.train(args, evaluate=_validator(args) if own.validate else None)
-    return _report(folder, task.id)
+    folder = runs.train(args, evaluate=_validator(args) if own.validate else None, limit=limit)
+    return _report(folder, task.id, limit)
 
 
-def _report(folder: Path, task_id: str) -> int:
+def _report(folder: Path, task_id: str, limit: TimeLimit) -> int:
     from rl2grid.experiments import runs
+    from rl2grid.experiments.energy import energy_line
 
+    used = energy_line(folder)
+    if used:
+        print(f"Energy of the run so far: {used}, see {folder / 'energy.json'}.")
+    if not runs.is_finished(folder) and limit.reached:
+        print(f"Run stopped by --max-minutes: {folder}. Go on with `rl2grid train --resume {folder}`.")
+        return 0
     if not runs.is_finished(folder):
         print(f"Run stopped: {folder}. Go on with `rl2grid train --resume {folder}`.")
         return INTERRUPTED
@@ -143,7 +171,7 @@ def _preset(flags: list[str]) -> str:
     return "default"
 
 
-def _parse(program: str, flags: list[str], hyperparameters: Hyperparameters) -> tuple[TrainFlags, Hyperparameters]:
+def _parse_both(program: str, flags: list[str], hyperparameters: Hyperparameters) -> tuple[TrainFlags, Hyperparameters]:
     """The flags of the run and of the algorithm, in one list."""
     import tyro
 
@@ -154,15 +182,26 @@ def _parse(program: str, flags: list[str], hyperparameters: Hyperparameters) -> 
             ("hyperparameters", tyro.conf.OmitArgPrefixes[type(hyperparameters)]),  # type: ignore[misc]
         ],
     )
+    parsed = _parse(program, flags, request(TrainFlags(), hyperparameters))
+    return parsed.flags, parsed.hyperparameters
+
+
+def _parse(program: str, flags: list[str], default: Any) -> Any:
+    """A dataclass like ``default`` with the values of the flags.
+
+    Raises:
+        UsageError: a flag or a value that does not exist.
+    """
+    import tyro
+
     complaint = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaint):
-            parsed = tyro.cli(request, prog=program, args=flags, default=request(TrainFlags(), hyperparameters))
+            return tyro.cli(type(default), prog=program, args=flags, default=default)
     except SystemExit as stop:
         if not stop.code:
             raise  # --help was asked for
         raise UsageError(f"{_sentence(complaint.getvalue())}; see {program} --help.") from None
-    return parsed.flags, parsed.hyperparameters
 
 
 def _sentence(box: str) -> str:

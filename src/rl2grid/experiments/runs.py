@@ -7,6 +7,8 @@ A run folder holds
 - ``checkpoint.pt``: everything needed to go on, see :mod:`rl2grid.algorithms.checkpoint`;
 - ``replay/``: what DQN, SAC and TD3 remember, until the run is finished, see :mod:`rl2grid.algorithms.replay`;
 - ``best.pt``: the best policy on the validation scenarios so far, see :func:`score`;
+- ``energy.json``: energy and CO2, see :mod:`rl2grid.experiments.energy`;
+- ``wandb.json``, ``wandb/``: of a tracked run, see :mod:`rl2grid.experiments.tracking`;
 - ``log.txt``: what happened when.
 
 A run that was interrupted and resumed any number of times ends with the same weights, bit for bit, and
@@ -22,7 +24,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, field, fields, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -40,6 +42,9 @@ from rl2grid.algorithms.policy_agent import BEST_FILE, CHECKPOINT_FILE, PolicyAg
 from rl2grid.envs.registration import register_all
 from rl2grid.envs.tasks import Task, TaskOptions, constraint_of, find_task
 from rl2grid.errors import UsageError, one_of
+from rl2grid.experiments.energy import EnergyAccount
+from rl2grid.experiments.limits import TimeLimit
+from rl2grid.experiments.tracking import check_tracking, tracked
 from rl2grid.mdp.actions import action_set_hash
 from rl2grid.mdp.constraints import THRESHOLDS
 from rl2grid.scenarios.library import generator_version, scenario_pack_hash
@@ -50,6 +55,8 @@ CONFIG_FILE = "config.json"
 LOG_FILE = "log.txt"
 LOCK_FILE = ".lock"
 REPLAY_FOLDER = "replay"
+
+UNLIMITED = TimeLimit(None)
 
 VectorEnvironment = gymnasium.vector.VectorEnv[Any, Any, Any]
 Evaluate = Callable[[PolicyAgent], Mapping[str, float]]
@@ -129,6 +136,8 @@ class RunArgs:
     """Decisions between two evaluations on the validation scenarios; there is one more at the end."""
     tensorboard: bool = True
     """Whether to write TensorBoard events beside ``metrics.csv``."""
+    wandb_project: str | None = None
+    """Project of Weights & Biases that gets the metrics; None: they stay here."""
     progress: bool = True
     """Whether to show a progress bar."""
 
@@ -188,16 +197,18 @@ def train(
     args: RunArgs,
     *,
     evaluate: Evaluate | None = None,
+    limit: TimeLimit = UNLIMITED,
     make_envs: Callable[[RunArgs], VectorEnvironment] = make_envs,
 ) -> Path:
     """Train from the beginning; returns the run folder.
 
     Ctrl-C (or a termination signal) ends the run after the current iteration, with a checkpoint; a second
-    one at once. Either way :func:`resume` goes on.
+    one at once. So does the time limit. In any case :func:`resume` goes on.
 
     Args:
         args: What to train.
         evaluate: Validation, which picks ``best.pt``; None: only ``checkpoint.pt`` is written.
+        limit: When to stop; there is one iteration at least.
         make_envs: Makes the training environments.
 
     Raises:
@@ -214,7 +225,7 @@ def train(
         identity = _identity(args)
         _create_folder(folder, args, identity)
         with _locked(folder):
-            _run(_Run(folder, args, identity, trainer, evaluate), None)
+            _run(_Run(folder, args, identity, trainer, evaluate), envs, limit, None)
     finally:
         envs.close()
     return folder
@@ -224,6 +235,7 @@ def resume(
     folder: Path,
     *,
     evaluate: Evaluate | None = None,
+    limit: TimeLimit = UNLIMITED,
     make_envs: Callable[[RunArgs], VectorEnvironment] = make_envs,
 ) -> Path:
     """Go on with the run in ``folder``, from its last checkpoint (or the beginning, if there is none yet).
@@ -232,6 +244,7 @@ def resume(
         UsageError: no run there, one that another process is writing, or one made of other data.
     """
     args, identity = read_config(folder)
+    check_tracking(args.wandb_project)
     with _locked(folder):
         now = _identity(args)
         for name in ("grid_hash", "scenario_pack_hash", "action_set_hash"):
@@ -249,7 +262,7 @@ def resume(
             run = _Run(folder, args, now, trainer, evaluate)
             if identity["versions"] != now["versions"]:
                 run.note(f"library versions differ from those the run began with: {now['versions']}")
-            _run(run, checkpoint)
+            _run(run, envs, limit, checkpoint)
         finally:
             envs.close()
     return folder
@@ -359,8 +372,8 @@ class _Run:
             log.write(f"{datetime.now(UTC).isoformat(timespec='seconds')} {text}\n")
 
 
-def _run(run: _Run, checkpoint: Mapping[str, Any] | None) -> None:
-    """Train until the budget is used up or a signal asks to stop."""
+def _run(run: _Run, envs: VectorEnvironment, limit: TimeLimit, checkpoint: Mapping[str, Any] | None) -> None:
+    """Train until the budget is used up, a signal asks to stop or the time is up; closes the environments."""
     args, trainer = run.args, run.trainer
     if isinstance(trainer, OffPolicyTrainer):
         trainer.store_in(run.folder / REPLAY_FOLDER)
@@ -368,33 +381,53 @@ def _run(run: _Run, checkpoint: Mapping[str, Any] | None) -> None:
         run.load(checkpoint)
     run.note(f"{'resumed' if checkpoint else 'started'} at {trainer.decisions} of {_budget(args, trainer)} decisions")
     after_step = trainer.decisions if checkpoint is not None else -1
-    metrics = MetricsWriter(run.folder, after_step=after_step, tensorboard=args.tensorboard)
     saved_at, saved_decisions = time.monotonic(), trainer.decisions
-    try:
-        with _stop_requests() as stop, _progress_bar(args, trainer) as show:
-            while not trainer.finished and not stop.is_set():
-                began, decisions, grid_steps = time.perf_counter(), trainer.decisions, trainer.grid_steps
-                values = trainer.iterate()
-                seconds = time.perf_counter() - began
-                values["charts/SPS"] = (trainer.decisions - decisions) / seconds
-                values["charts/grid_SPS"] = (trainer.grid_steps - grid_steps) / seconds
-                due = trainer.decisions // args.evaluate_every > decisions // args.evaluate_every
-                validated = run.evaluate is not None and (due or trainer.finished)
-                if validated:
-                    values |= run.validate()
-                run.wall_time += time.perf_counter() - began
-                metrics.write(trainer.decisions, trainer.grid_steps, run.wall_time, values)
-                show(values.get("charts/survival"), run.best_survival)
-                if validated or time.monotonic() - saved_at >= args.checkpoint_seconds:
-                    run.save()
-                    saved_at, saved_decisions = time.monotonic(), trainer.decisions
-            if trainer.decisions != saved_decisions:
+    config = {"request": _request(args), "identity": dict(run.identity)}
+    with (
+        closing(MetricsWriter(run.folder, after_step=after_step, tensorboard=args.tensorboard)) as metrics,
+        tracked(run.folder, args.wandb_project, config) as track,
+        _accounted(run.folder, trainer, envs) as energy,
+        _stop_requests() as stop,
+        _progress_bar(args, trainer) as show,
+    ):
+        while not trainer.finished and not stop.is_set():
+            began, decisions, grid_steps = time.perf_counter(), trainer.decisions, trainer.grid_steps
+            values = trainer.iterate()
+            seconds = time.perf_counter() - began
+            values["charts/SPS"] = (trainer.decisions - decisions) / seconds
+            values["charts/grid_SPS"] = (trainer.grid_steps - grid_steps) / seconds
+            due = trainer.decisions // args.evaluate_every > decisions // args.evaluate_every
+            validated = run.evaluate is not None and (due or trainer.finished)
+            if validated:
+                values |= run.validate()
+            run.wall_time += time.perf_counter() - began
+            metrics.write(trainer.decisions, trainer.grid_steps, run.wall_time, values)
+            track(trainer.decisions, values)
+            show(values.get("charts/survival"), run.best_survival)
+            if validated or time.monotonic() - saved_at >= args.checkpoint_seconds:
                 run.save()
-            if trainer.finished:
-                shutil.rmtree(run.folder / REPLAY_FOLDER, ignore_errors=True)
-    finally:
-        metrics.close()
+                energy.save()
+                saved_at, saved_decisions = time.monotonic(), trainer.decisions
+            if limit.reached:
+                break
+        if trainer.decisions != saved_decisions:
+            run.save()
+        if trainer.finished:
+            shutil.rmtree(run.folder / REPLAY_FOLDER, ignore_errors=True)
     run.note(f"{'finished' if trainer.finished else 'stopped'} at {trainer.decisions} decisions")
+
+
+@contextmanager
+def _accounted(folder: Path, trainer: Trainer, envs: VectorEnvironment) -> Iterator[EnergyAccount]:
+    """The energy account of a run, complete at the end; closes the environments."""
+    account, decisions = EnergyAccount(folder), trainer.decisions
+    try:
+        yield account
+    finally:
+        # The processor time of worker processes is known once they have ended.
+        envs.close()
+        if trainer.decisions > decisions:
+            account.finish()
 
 
 def _budget(args: RunArgs, trainer: Trainer) -> int:
@@ -479,6 +512,7 @@ def _resolved(args: RunArgs) -> RunArgs:
         raise UsageError(f"Training on the {keywords['split']} scenarios is refused: choose split {TRAIN!r}.")
     if args.evaluate_every < 1:
         raise UsageError(f"evaluate_every must be at least 1 decision, not {args.evaluate_every}.")
+    check_tracking(args.wandb_project)
     folder = args.folder or Path("runs") / f"{_slug(task)}-{args.algorithm}-{args.hyperparameters.seed}"
     resolved = replace(args, task=task.id, folder=Path(folder), env_keywords=keywords)
     find_limits(resolved)  # refuses what cannot be constrained
@@ -522,13 +556,11 @@ def _identity(args: RunArgs) -> dict[str, Any]:
 
 def _create_folder(folder: Path, args: RunArgs, identity: Mapping[str, Any]) -> None:
     """Make the run folder with its configuration: it appears complete or not at all."""
-    request = asdict(args)
-    del request["folder"]
     seeds = {
         "algorithm": args.hyperparameters.seed,
         "first_environment": args.hyperparameters.seed * args.hyperparameters.num_envs,
     }
-    config = {"request": request, "identity": dict(identity), "seeds": seeds}
+    config = {"request": _request(args), "identity": dict(identity), "seeds": seeds}
     folder.parent.mkdir(parents=True, exist_ok=True)
     temporary = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
     temporary.mkdir()
@@ -538,6 +570,13 @@ def _create_folder(folder: Path, args: RunArgs, identity: Mapping[str, Any]) -> 
     except OSError as error:
         shutil.rmtree(temporary, ignore_errors=True)
         raise UsageError(f"Folder {str(folder)!r} cannot be made: {error.strerror}.") from error
+
+
+def _request(args: RunArgs) -> dict[str, Any]:
+    """The request as it is stored: wherever the folder is, it is the same run."""
+    request = asdict(args)
+    del request["folder"]
+    return request
 
 
 @contextmanager
