@@ -102,7 +102,7 @@ def _started_tracker() -> Any:
         from codecarbon import EmissionsTracker
 
         tracker = EmissionsTracker(
-            save_to_file=False, log_level="critical", tracking_mode="process", allow_multiple_runs=True
+            output_methods=[], log_level="critical", tracking_mode="process", allow_multiple_runs=True
         )
         tracker.start()
     except Exception:  # no reason to end a training
