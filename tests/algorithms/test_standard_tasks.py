@@ -1,0 +1,66 @@
+"""SAC and TD3 swing Gymnasium's pendulum up; PPO's CartPole and tasks of known optima are in the algorithms' own tests."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers import RescaleAction
+
+from rl2grid.algorithms import sac, td3
+from rl2grid.algorithms.off_policy import OffPolicyTrainer
+
+PENDULUM: dict[str, Any] = {
+    "seed": 1,
+    "num_steps": 50,
+    "batch_size": 64,
+    "mask_actions": False,
+    "normalize_observations": False,
+    "total_timesteps": 8_000,
+    "num_envs": 4,
+    "learning_starts": 800,
+    "train_frequency": 1,
+    "gamma": 0.95,
+    "reward_scale": 0.1,
+    "actor_learning_rate": 1e-3,
+    "critic_learning_rate": 2e-3,
+    "tau": 0.01,
+    "actor_layers": (64, 64),
+    "critic_layers": (64, 64),
+}
+
+
+def pendulum(num_envs: int) -> SyncVectorEnv:
+    """With the torque as a share of the largest."""
+    makers = [lambda: RescaleAction(gymnasium.make("Pendulum-v1"), np.float32(-1.0), np.float32(1.0))] * num_envs
+    return SyncVectorEnv(makers, autoreset_mode=AutoresetMode.SAME_STEP)
+
+
+def mean_return(trainer: OffPolicyTrainer, envs: SyncVectorEnv) -> float:
+    """Of the deterministic policy after training, over one episode in each environment."""
+    while not trainer.finished:
+        trainer.iterate()
+    network: Any = trainer.policy()[0]
+    observations, _ = envs.reset(seed=1000)
+    returns, alive = np.zeros(envs.num_envs), np.ones(envs.num_envs, np.bool_)
+    while alive.any():
+        with torch.no_grad():
+            actions = network.act(torch.as_tensor(observations), None, None)
+        observations, rewards, terminated, truncated, _ = envs.step(actions.numpy())
+        returns += rewards * alive
+        alive &= ~(terminated | truncated)
+    return float(returns.mean())
+
+
+@pytest.mark.slow
+def test_sac_swings_the_pendulum_up():
+    assert mean_return(sac.SAC(sac.Args(**PENDULUM), pendulum(4)), pendulum(10)) > -250.0  # at random -1200
+
+
+@pytest.mark.slow
+def test_td3_swings_the_pendulum_up():
+    assert mean_return(td3.TD3(td3.Args(**PENDULUM), pendulum(4)), pendulum(10)) > -250.0
