@@ -21,6 +21,12 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --progress-bar on --constraint constraints.txt --editable ".[train,analysis,dev]"
 	@touch $@
 
+# RLlib and TorchRL are large: only the longer tests need them.
+$(VENV)/.installed-examples: $(VENV)/.installed
+	@echo "== Installing the libraries of the examples (about a minute)"
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --progress-bar on --constraint constraints.txt --editable ".[examples]"
+	@touch $@
+
 demo: $(VENV)/.installed
 	@$(BIN)/rl2grid demo
 
@@ -34,7 +40,7 @@ test: lint
 	@echo "== Tests"
 	@$(BIN)/python -m pytest -m "not slow" -n $(WORKERS) --dist worksteal
 
-test-slow: $(VENV)/.installed
+test-slow: $(VENV)/.installed-examples
 	@$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
 clean:

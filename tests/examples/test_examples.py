@@ -1,0 +1,88 @@
+"""The scripts under ``examples/`` train unchanged ids with other libraries, run as a user runs them."""
+
+import ast
+import importlib.util
+import os
+import re
+import runpy
+import secrets
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+NEEDS = {
+    "stable_baselines3_ppo": "stable_baselines3",
+    "stable_baselines3_sac": "stable_baselines3",
+    "stable_baselines3_vector": "stable_baselines3",
+    "maskable_ppo": "sb3_contrib",
+    "torchrl_ppo": "torchrl",
+    "rllib_ppo": "ray",
+}
+QUICK = ("stable_baselines3_ppo", "stable_baselines3_sac", "stable_baselines3_vector", "maskable_ppo")
+
+
+def play(name, arguments, monkeypatch, capsys):
+    """What the script writes to its standard output, in this process: each that loads PyTorch anew takes seconds."""
+    monkeypatch.setattr(sys, "argv", [f"{name}.py", *arguments])
+    runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
+    return capsys.readouterr().out
+
+
+def run(name, *arguments):
+    """What the script writes to its standard output, in a process of its own."""
+    # Without a token of its own Ray would leave one in the home directory.
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
+    script = [sys.executable, EXAMPLES / f"{name}.py", *arguments]
+    done = subprocess.run(script, capture_output=True, text=True, env=environment, timeout=540, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def assert_survived(said):
+    found = re.search(r"^survival .*: (\d\.\d{3})$", said, re.MULTILINE)
+    assert found, said
+    assert 0 < float(found[1]) <= 1
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_trains_with_stable_baselines3(name, monkeypatch, capsys):
+    pytest.importorskip(NEEDS[name])
+    assert_survived(play(name, ["--steps", "200"], monkeypatch, capsys))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in NEEDS if name not in QUICK])
+def test_trains_with_larger_libraries(name):
+    pytest.importorskip(NEEDS[name])
+    assert_survived(run(name, "--steps", "600"))
+
+
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.stem)
+def test_is_short_and_says_how_to_install(path):
+    text = path.read_text()
+    assert len(text.splitlines()) < 80
+    assert 'pip install -e ".[examples]"' in (ast.get_docstring(ast.parse(text)) or "")
+
+
+def test_every_example_is_run():
+    ran = {*NEEDS, "graph_observations"}
+    assert {path.stem for path in EXAMPLES.glob("*.py")} == ran
+
+
+def test_graph_observations_without_pytorch_geometric(monkeypatch, capsys):
+    said = play("graph_observations", ["--steps", "3"], monkeypatch, capsys)
+    assert "edge_index" in said
+    assert ("Data(" in said) == (importlib.util.find_spec("torch_geometric") is not None)
+
+
+def test_the_blocks_of_the_page_run():
+    pytest.importorskip("stable_baselines3")
+    page = (EXAMPLES.parent / "docs" / "interfaces.md").read_text()
+    names = {}
+    for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        exec(block, names)
+    assert names["graphs"]["nodes"].shape[0] == 8
+    assert names["costs"].shape == (8,)
