@@ -1,4 +1,4 @@
-"""SAC and TD3 swing Gymnasium's pendulum up; PPO's CartPole and tasks of known optima are in the algorithms' own tests."""
+"""SAC and TD3 swing Gymnasium's pendulum up; CartPole and tasks of known optima are in the algorithms' own tests."""
 
 from __future__ import annotations
 
