@@ -54,15 +54,19 @@ def episode(scenario: str = "may", seed: int = 0, survival: float = 1.0, **chang
     return Episode(**{**values, **changes})
 
 
-def result(agent: str, survivals: list[list[float]], heuristic: str | None = None, **identity: Any) -> EvaluationResult:
+def result(
+    agent: str, survivals: list[list[float]], heuristic: str | None = None, agent_hash: str = "", **identity: Any
+) -> EvaluationResult:
     """Survivals by scenario, then seed."""
+    words = {"task": TASK, "agent": agent, "heuristic": heuristic, "split": "validation", "versions": {"rl2grid": "0"}}
+    words |= identity
+    of_all = {"agent": agent, "heuristic": heuristic or "none", "agent_hash": agent_hash, "task": words["task"]}
     episodes = tuple(
-        episode(f"scenario {k}", seed, survival, agent=agent, heuristic=heuristic or "none")
+        episode(f"scenario {k}", seed, survival, **of_all)
         for k, row in enumerate(survivals)
         for seed, survival in enumerate(row)
     )
-    words = {"task": TASK, "agent": agent, "heuristic": heuristic, "split": "validation", "versions": {"rl2grid": "0"}}
-    return EvaluationResult(episodes, {**words, **identity}, f"rl2grid evaluate {agent}")
+    return EvaluationResult(episodes, words, f"rl2grid evaluate {agent}")
 
 
 def curve(label: str = "ppo", seed: int = 0, n: int = 30) -> TrainingCurve:

@@ -1,0 +1,49 @@
+"""``rl2grid analyse``: from folders to tables and figures, and how it refuses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from rl2grid.cli.main import main
+from rl2grid.experiments.evaluation import evaluate
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two evaluations of a month of bus14, which both lose within days."""
+    folder = tmp_path_factory.mktemp("evaluations")
+    evaluate("do-nothing", "bus14-T0", scenarios=["generated/700000-00"], output=folder / "nothing")
+    evaluate("random", "bus14-T0", scenarios=["generated/700000-00"], output=folder / "random")
+    return folder
+
+
+def analyse(folder: Path, *names: str) -> Sequence[str]:
+    return ["analyse", *names, "--output", str(folder / "section")]
+
+
+def test_tables_and_figures_are_written(folder, capsys, monkeypatch):
+    monkeypatch.setattr("rl2grid.analysis.section.evaluation_pictures", lambda methods: [])
+    assert main(analyse(folder, str(folder / "nothing"), f"dice={folder / 'random'}")) == 0
+    assert "6 tables and 0 figures" in capsys.readouterr().out
+    table = (folder / "section" / "tables" / "survival-topology.md").read_text()
+    assert "Baselines do-nothing" in table
+    assert "Baselines dice" in table
+    assert f"dice={folder / 'random'}" in (folder / "section" / "index.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("names", "part"),
+    [
+        (["{}"], "holds neither an evaluation nor a run"),
+        (["{}/nothing", "{}/nothing"], "was given twice"),
+        (["=x"], "give FOLDER or LABEL=FOLDER"),
+    ],
+)
+def test_refusals_are_one_sentence(folder, capsys, names, part):
+    assert main(analyse(folder / "refused", *(name.format(folder) for name in names))) == 2
+    (sentence,) = capsys.readouterr().err.strip().splitlines()
+    assert part in sentence
+    assert not (folder / "refused").exists()
