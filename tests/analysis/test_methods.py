@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from sample_results import TASK, result
 
-from rl2grid.analysis.methods import group_methods
+from rl2grid.analysis.methods import group_methods, resampled_units
 from rl2grid.analysis.statistics import Unit
 from rl2grid.analysis.training import group_curves, read_training_run
 from rl2grid.errors import UsageError
@@ -28,6 +28,7 @@ def test_runs_of_one_agent_are_one_method():
     assert scores.unit is Unit.RUN
     assert methods[0].scenarios == ("scenario 0", "scenario 1")
     assert methods[0].is_trained
+    assert resampled_units(methods) == "training runs, else seeds within scenarios"
 
 
 def test_dying_early_is_cheap_but_not_safe():

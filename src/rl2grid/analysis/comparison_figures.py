@@ -16,7 +16,7 @@ from matplotlib.ticker import FuncFormatter, PercentFormatter
 from rl2grid.analysis import figures
 from rl2grid.analysis.figures import STEPS_PER_DAY
 from rl2grid.analysis.lifetimes import kaplan_meier, lifetimes
-from rl2grid.analysis.methods import COSTS, Method
+from rl2grid.analysis.methods import COSTS, Method, resampled_units
 from rl2grid.analysis.result_tables import AGGREGATES
 from rl2grid.analysis.statistics import Estimate, estimate, probability_of_improvement, score_band, share_above
 from rl2grid.drawing.theme import BLUE, LIGHT, VERMILLION, Theme, style
@@ -43,7 +43,9 @@ def draw_profiles(methods: Sequence[Method], *, theme: Theme = LIGHT) -> Figure:
         _percent(axes.xaxis, axes.yaxis)
         axes.grid()
         _legend(figure)
-        figures._headline(axes, _title("Performance profiles", methods), f"band: 95% interval over {_units(methods)}")
+        figures._headline(
+            axes, _title("Performance profiles", methods), f"band: 95% interval over {resampled_units(methods)}"
+        )
     return figure
 
 
@@ -58,7 +60,7 @@ def draw_aggregates(methods: Sequence[Method], *, theme: Theme = LIGHT) -> Figur
             axes.set_xlabel(f"{name[0].upper()}{name[1:]}")
             axes.xaxis.set_major_formatter(PercentFormatter(1.0, symbol=""))
         _name_rows(panels[0], methods)
-        units = _units(methods)
+        units = resampled_units(methods)
         sentence = f"95% interval over {units}; gap: less is better"
         figures.headline_of_panels(figure, _title("Survival in %", methods), sentence)
     return figure
@@ -68,7 +70,7 @@ def draw_improvements(methods: Sequence[Method], *, theme: Theme = LIGHT) -> Fig
     """P(row survives longer than column) in the same month, with 95% intervals in small print."""
     n = len(methods)
     with matplotlib.rc_context(style(theme)):
-        figure = Figure(figsize=(2.2 + 0.72 * n, 1.9 + 0.5 * n), layout="constrained")
+        figure = Figure(figsize=(max(5.4, 2.2 + 0.72 * n), 1.9 + 0.5 * n), layout="constrained")
         axes = figure.subplots()
         colours = LinearSegmentedColormap.from_list("improvement", [VERMILLION, theme.background, BLUE])
         for row, column in itertools.product(range(n), repeat=2):
@@ -186,7 +188,7 @@ def draw_costs(methods: Sequence[Method], *, theme: Theme = LIGHT) -> Figure:
             share.set(xlim=(0, 1), xlabel=f"{name} kept and completed")
             _percent(share.xaxis)
         _name_rows(panels[0], methods)
-        sentence = f"red: threshold of the cost; black: 95% interval over {_units(methods)}"
+        sentence = f"red: threshold of the cost; black: 95% interval over {resampled_units(methods)}"
         figures.headline_of_panels(figure, _title("Costs of an episode", methods), sentence)
     return figure
 
@@ -238,7 +240,7 @@ def _draw_ablation(
         _percent(axes.yaxis)
         axes.grid(axis="y")
         _legend(figure)
-        figures._headline(axes, title, f"bar: 95% interval over {_units([method for _, _, method in points])}")
+        figures._headline(axes, title, f"bar: 95% interval over {resampled_units([method for _, _, method in points])}")
     return figure
 
 
@@ -300,7 +302,3 @@ def _legend(figure: Figure) -> None:
 
 def _title(words: str, methods: Sequence[Method]) -> str:
     return f"{words}: {methods[0].task.id.removeprefix('rl2grid/')}"
-
-
-def _units(methods: Sequence[Method]) -> str:
-    return " or ".join(sorted({method.scores("survival").unit.value for method in methods}))

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from rl2grid.analysis.episodes import Episode
 from rl2grid.analysis.results import EvaluationResult, check_comparable
-from rl2grid.analysis.statistics import Scores
+from rl2grid.analysis.statistics import Scores, Unit
 from rl2grid.analysis.summary import by_scenario
 from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
@@ -92,6 +92,12 @@ def group_methods(results: Sequence[EvaluationResult]) -> dict[str, tuple[Method
         check_comparable(group)
     _check_same_question([group[0] for group in by_task.values()])
     return {task: _methods(group) for task, group in by_task.items()}
+
+
+def resampled_units(methods: Iterable[Method]) -> str:
+    """What intervals of these methods are about, in words: the coarsest of what was repeated."""
+    units = {method.scores("survival").unit for method in methods}
+    return ", else ".join(unit.value for unit in Unit if unit in units)
 
 
 def _methods(results: Sequence[EvaluationResult]) -> tuple[Method, ...]:

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 
 from rl2grid.analysis.lifetimes import kaplan_meier, lifetimes, log_rank
-from rl2grid.analysis.methods import COSTS, Method
+from rl2grid.analysis.methods import COSTS, Method, resampled_units
 from rl2grid.analysis.statistics import (
     Aggregate,
     estimate,
@@ -233,8 +233,7 @@ def _task_name(method: Method) -> str:
 
 
 def _units(methods: Methods, tasks: Iterable[str]) -> str:
-    units = {method.scores("survival").unit.value for task in tasks for method in methods[task]}
-    return " or ".join(sorted(units))
+    return resampled_units(method for task in tasks for method in methods[task])
 
 
 def _short(reason: GameOver) -> str:
