@@ -56,7 +56,7 @@ class Ray:
         try:
             import ray
         except ImportError:
-            raise UsageError("The backend ray needs Ray: install it with `pip install rl2grid[ray]`.") from None
+            raise UsageError("The backend ray needs Ray: `pip install rl2grid[ray]` installs it.") from None
         self._ray = ray
         if not ray.is_initialized():
             try:

@@ -40,7 +40,7 @@ from rl2grid.experiments import runs
 from rl2grid.experiments.evaluation import validator
 from rl2grid.experiments.interrupts import stop_requests
 from rl2grid.experiments.study import NO_HEURISTIC, evenly_spread
-from rl2grid.experiments.study_cell import METRICS_FILE, STOPPED, CellProcess, serve, write_json
+from rl2grid.experiments.study_cell import METRICS_FILE, STOPPED, CellProcess, is_busy, serve, write_json
 from rl2grid.experiments.study_file import as_table, count, read_toml, refuse_unknown_keys, text, unknown
 
 TUNING_FILE, JOURNAL_FILE, BEST_FILE = "tuning.json", "journal.log", "best.json"
@@ -357,6 +357,9 @@ def _put_back_interrupted(tuning: Tuning) -> None:
     study = _open(tuning)
     for trial in study.get_trials(deepcopy=False):
         if trial.state == state.RUNNING:
+            # Its process may live a little longer than the one that started it, to write a checkpoint.
+            while is_busy(tuning.output / TRIALS_FOLDER / trial.user_attrs.get("run", "none")):
+                time.sleep(0.2)
             study.tell(trial.number, state=state.FAIL)
             if trial.params:
                 study.enqueue_trial(trial.params)
