@@ -46,6 +46,7 @@ from rl2grid.experiments.study_file import (
     upper,
     with_tuples,
 )
+from rl2grid.mdp.rewards import resolve_reward
 from rl2grid.scenarios.library import list_scenarios
 from rl2grid.scenarios.splits import SPLITS
 
@@ -317,6 +318,7 @@ class _Group:
         keywords = with_tuples(table)
         try:
             TaskOptions(heuristic=heuristic, **keywords)
+            resolve_reward(keywords.get("reward", "default"))
         except UsageError as error:
             raise UsageError(f"{upper(self.where)}: {error}") from None
         return keywords

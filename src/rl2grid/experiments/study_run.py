@@ -24,6 +24,7 @@ from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.progress_bar import ProgressBar
 from rich.table import Table
+from rich.text import Text
 
 from rl2grid.analysis.episodes import COLUMNS, EPISODES_FILE, format_row, read_episodes
 from rl2grid.analysis.training import VALIDATION
@@ -291,12 +292,12 @@ def study_table(study: Study, states: Sequence[CellState], remaining: float | No
     for column in ("cell", "state", "progress", "best survival", ""):
         table.add_column(column, no_wrap=column == "cell")
     for state in states:
-        if state.state not in (State.RUNNING, State.FAILED, State.STOPPED):
-            continue
-        best = "-" if state.tail.best is None else f"{state.tail.best:.3f}"
-        stage = f"{state.tail.decisions:,} of {state.decisions:,}" if state.decisions else "evaluation"
-        table.add_row(state.cell.name, state.state, ProgressBar(1.0, state.share, width=20), best, state.error or stage)
-    return Group(head, table) if table.row_count else head
+        if state.state in (State.RUNNING, State.STOPPED):
+            best = "-" if state.tail.best is None else f"{state.tail.best:.3f}"
+            stage = f"{state.tail.decisions:,} of {state.decisions:,}" if state.decisions else "evaluation"
+            table.add_row(state.cell.name, state.state, ProgressBar(1.0, state.share, width=20), best, stage)
+    failures = [Text(f"{state.cell.name} failed: {state.error}") for state in states if state.state == State.FAILED]
+    return Group(head, *([table] if table.row_count else []), *failures)
 
 
 def results_table(states: Sequence[CellState]) -> Table:
