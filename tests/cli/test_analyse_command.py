@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -34,10 +35,20 @@ def test_tables_and_figures_are_written(folder, capsys, monkeypatch):
     assert f"dice={folder / 'random'}" in (folder / "section" / "index.md").read_text()
 
 
+def test_evaluations_below_a_folder_are_those_of_the_split(folder, capsys, monkeypatch):
+    monkeypatch.setattr("rl2grid.analysis.section.evaluation_pictures", lambda methods: [])
+    for name in ("test", "validation-idle"):
+        (folder / "agent" / "evaluation").mkdir(parents=True, exist_ok=True)
+        shutil.copytree(folder / "nothing", folder / "agent" / "evaluation" / name)
+    assert main(analyse(folder, str(folder / "agent"))) == 0
+    assert "5 tables" in capsys.readouterr().out
+    assert main([*analyse(folder, str(folder / "agent")), "--split", "train"]) == 2
+
+
 @pytest.mark.parametrize(
     ("names", "part"),
     [
-        (["{}"], "holds neither an evaluation nor a run"),
+        (["{}"], "holds neither a run nor an evaluation on validation"),
         (["{}/nothing", "{}/nothing"], "was given twice"),
         (["=x"], "give FOLDER or LABEL=FOLDER"),
     ],

@@ -28,10 +28,10 @@ def add_parser(commands: Any) -> None:
         "folders",
         nargs="+",
         metavar="folder",
-        help="an evaluation, or a run, whose evaluation on --split is taken too; LABEL=FOLDER names it in the results",
+        help="an evaluation, or a run, whose evaluations on --split are taken too; LABEL=FOLDER names it in the results",
     )
     parser.add_argument("--output", type=Path, required=True, help="folder of the tables and figures")
-    parser.add_argument("--split", default="validation", choices=SPLITS, help="which evaluation of a run is taken")
+    parser.add_argument("--split", default="validation", choices=SPLITS, help="which evaluations of a run are taken")
     parser.add_argument("--theme", default=THEMES[0], choices=THEMES, help="colours of the figures")
     parser.set_defaults(run=_run)
 
@@ -65,19 +65,24 @@ def _load(folders: Sequence[str], split: str) -> tuple[list[EvaluationResult], l
     runs: list[TrainingRun] = []
     for words in folders:
         label, folder = _parse(words)
-        if (folder / EVALUATION_FILE).is_file():
-            results.append(_named(load_evaluation(folder), label))
-        elif (folder / RUN_FILE).is_file():
+        evaluations = _evaluations(folder, split)
+        results += [_named(load_evaluation(evaluation), label) for evaluation in evaluations]
+        if (folder / RUN_FILE).is_file():
             runs.append(read_training_run(folder, label))
-            evaluation = folder / "evaluation" / split
-            if evaluation.is_dir():
-                results.append(_named(load_evaluation(evaluation), label))
-        else:
+        elif not evaluations:
             raise UsageError(
-                f"{folder} holds neither an evaluation nor a run: give folders that 'rl2grid evaluate' or "
-                "'rl2grid train' wrote."
+                f"{folder} holds neither a run nor an evaluation on {split}: give folders that 'rl2grid train' or "
+                "'rl2grid evaluate' wrote."
             )
     return results, runs
+
+
+def _evaluations(folder: Path, split: str) -> list[Path]:
+    """The folder itself, or those below it of the split, which 'rl2grid evaluate' names after what else was asked."""
+    if (folder / EVALUATION_FILE).is_file():
+        return [folder]
+    below = (folder / "evaluation").glob(f"{split}*")
+    return sorted(path for path in below if (path / EVALUATION_FILE).is_file())
 
 
 def _parse(words: str) -> tuple[str | None, Path]:
