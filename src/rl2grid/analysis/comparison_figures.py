@@ -43,9 +43,8 @@ def draw_profiles(methods: Sequence[Method], *, theme: Theme = LIGHT) -> Figure:
         _percent(axes.xaxis, axes.yaxis)
         axes.grid()
         _legend(figure)
-        figures._headline(
-            axes, _title("Performance profiles", methods), f"band: 95% interval over {resampled_units(methods)}"
-        )
+        sentence = f"band: 95% interval over {resampled_units(methods)}"
+        figures._headline(axes, _title("Performance profiles", methods), sentence)
     return figure
 
 

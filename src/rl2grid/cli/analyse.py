@@ -28,7 +28,7 @@ def add_parser(commands: Any) -> None:
         "folders",
         nargs="+",
         metavar="folder",
-        help="an evaluation, or a run, whose evaluations on --split are taken too; LABEL=FOLDER names it in the results",
+        help="an evaluation, or a run, whose evaluations on --split are taken too; LABEL=FOLDER names it",
     )
     parser.add_argument("--output", type=Path, required=True, help="folder of the tables and figures")
     parser.add_argument("--split", default="validation", choices=SPLITS, help="which evaluations of a run are taken")
