@@ -141,7 +141,7 @@ def test_what_it_plays_is_better_than_nothing_by_the_forecast():
     observation, info = env.reset(seed=3)
     agent.reset(0)
     n_played = 0
-    for _ in range(5):
+    for _ in range(2):
         action = agent.act(observation, info)
         outcomes = env.unwrapped.what_if([0, action])
         assert outcomes.legal[1]
@@ -163,6 +163,8 @@ def test_redispatching_tasks_are_refused():
 def test_arguments_must_be_positive():
     with pytest.raises(UsageError, match="positive number of seconds"):
         Milp(time_limit=0)
+    with pytest.raises(UsageError, match="node_limit=0 is not allowed"):
+        Milp(node_limit=0)
     with pytest.raises(UsageError, match="at least 1"):
         Milp(attempts=0)
 
