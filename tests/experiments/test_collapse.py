@@ -62,7 +62,7 @@ def test_without_the_balancing_generator_everything_is_cut_off(state):
     assert collapse(state, 1, "").last_cut_off == " ".join(map(str, range(14)))
 
 
-@pytest.mark.parametrize("heuristic", [None, "idle", "recovery"])
+@pytest.mark.parametrize("heuristic", [pytest.param(None, marks=pytest.mark.slow), "idle"])
 def test_rows_name_what_the_state_before_the_game_over_showed(heuristic):
     register_all()
     env = gymnasium.make("rl2grid/bus14-T0-v0", disable_env_checker=True, split="validation", heuristic=heuristic)
