@@ -20,7 +20,7 @@ import torch
 from toy_grid import ToyGrid
 
 import rl2grid
-from rl2grid.algorithms.checkpoint import load_checkpoint
+from rl2grid.algorithms.checkpoint import load_checkpoint, save_checkpoint
 from rl2grid.algorithms.policy_agent import PolicyAgent, load_agent
 from rl2grid.algorithms.ppo import Args
 from rl2grid.errors import UsageError
@@ -270,6 +270,15 @@ def test_a_run_is_not_resumed_with_other_data(tmp_path: Path):
     config["identity"]["action_set_hash"] = "0123"
     (folder / "config.json").write_text(json.dumps(config))
     with pytest.raises(UsageError, match="action_set_hash was 0123"):
+        resume(folder, make_envs=toy_envs)
+
+
+def test_a_checkpoint_of_another_version_is_not_resumed(tmp_path: Path):
+    folder = train(request(tmp_path / "run"), make_envs=toy_envs)
+    contents = load_checkpoint(folder / "checkpoint.pt")
+    del contents["run"]["best_score"]
+    save_checkpoint(folder / "checkpoint.pt", contents)
+    with pytest.raises(UsageError, match="lacks 'best_score', because another version of rl2grid wrote it"):
         resume(folder, make_envs=toy_envs)
 
 

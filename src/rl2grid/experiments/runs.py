@@ -20,8 +20,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import signal
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
@@ -43,6 +41,7 @@ from rl2grid.envs.registration import register_all
 from rl2grid.envs.tasks import Task, TaskOptions, constraint_of, find_task
 from rl2grid.errors import UsageError, one_of
 from rl2grid.experiments.energy import EnergyAccount
+from rl2grid.experiments.interrupts import stop_requests
 from rl2grid.experiments.limits import TimeLimit
 from rl2grid.experiments.tracking import check_tracking, tracked
 from rl2grid.mdp.actions import action_set_hash
@@ -340,9 +339,14 @@ class _Run:
 
     def load(self, checkpoint: Mapping[str, Any]) -> None:
         """Be where the run was when ``checkpoint`` was written."""
-        self.trainer.load_state_dict(checkpoint["training"])
-        self.best_score = checkpoint["run"]["best_score"]
-        self.wall_time = checkpoint["run"]["wall_time"]
+        try:
+            self.best_score, self.wall_time = checkpoint["run"]["best_score"], checkpoint["run"]["wall_time"]
+            self.trainer.load_state_dict(checkpoint["training"])
+        except KeyError as error:
+            raise UsageError(
+                f"The checkpoint in {str(self.folder)!r} lacks {error}, because another version of rl2grid wrote it: "
+                "go on with that version, or begin a new run."
+            ) from error
 
     def validate(self) -> dict[str, float]:
         """Evaluate the policy as it is, and keep it if it is the best so far."""
@@ -387,7 +391,7 @@ def _run(run: _Run, envs: VectorEnvironment, limit: TimeLimit, checkpoint: Mappi
         closing(MetricsWriter(run.folder, after_step=after_step, tensorboard=args.tensorboard)) as metrics,
         tracked(run.folder, args.wandb_project, config) as track,
         _accounted(run.folder, trainer, envs) as energy,
-        _stop_requests() as stop,
+        stop_requests() as stop,
         _progress_bar(args, trainer) as show,
     ):
         while not trainer.finished and not stop.is_set():
@@ -433,31 +437,6 @@ def _accounted(folder: Path, trainer: Trainer, envs: VectorEnvironment) -> Itera
 def _budget(args: RunArgs, trainer: Trainer) -> int:
     """Decisions of the whole run: the largest number of full iterations within the request."""
     return trainer.num_iterations * args.hyperparameters.num_envs * args.hyperparameters.num_steps
-
-
-@contextmanager
-def _stop_requests() -> Iterator[threading.Event]:
-    """An event set by the first interrupt or termination signal; the second one has its usual effect."""
-    stop = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield stop
-        return
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-
-    def restore() -> None:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-    def request(number: int, frame: object) -> None:
-        stop.set()
-        restore()
-
-    for number in before:
-        signal.signal(number, request)
-    try:
-        yield stop
-    finally:
-        restore()
 
 
 @contextmanager
