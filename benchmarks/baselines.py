@@ -10,25 +10,25 @@ the environment) that is in the ledger is not played again: what was chosen afte
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import os
-import shlex
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from rl2grid.algorithms.policy_agent import load_agent
 from rl2grid.analysis.results import EvaluationResult, identity_hash
 from rl2grid.analysis.statistics import Estimate
+from rl2grid.analysis.training import read_training_run, read_validations
 from rl2grid.envs.tasks import find_task
 from rl2grid.errors import UsageError
+from rl2grid.experiments.commands import train_command
 from rl2grid.experiments.evaluation import AS_TRAINED, evaluate
-from rl2grid.experiments.runs import RunArgs, hyperparameters, is_finished, read_config
+from rl2grid.experiments.runs import is_finished, read_config
+from rl2grid.experiments.study_cell import trained_seconds
 
 LEDGER = Path(__file__).resolve().parent / "results" / "baselines.json"
-WITHOUT_INFLUENCE = frozenset({"torch_threads", "device"})
 
 
 @dataclass(frozen=True)
@@ -77,54 +77,22 @@ def _trained(folder: Path) -> Subject:
         "env_keywords": dict(args.env_keywords),
     }
     policy = load_agent(folder)
-    rows = _validations(folder)
+    reached = read_validations(folder)
+    if not reached:
+        raise UsageError(f"The run in {str(folder)!r} was never validated: only a best policy is tested.")
+    survival = read_training_run(folder).curve.validation
+    assert survival is not None
     training = {
-        "command": _train_command(args),
-        "decisions": max(rows),
-        "grid_steps": rows[max(rows)]["grid_steps"],
-        "minutes": round(rows[max(rows)]["wall_time"] / 60, 1),
+        "command": train_command(args),
+        "decisions": max(reached),
+        "grid_steps": int(survival.grid_steps[-1]),
+        "minutes": round(trained_seconds(folder) / 60, 1),
         "best_after": policy.identity["decisions"],
-        "validation_survival": rows[policy.identity["decisions"]]["validation/survival"],
+        "validation_survival": reached[policy.identity["decisions"]]["survival"],
         "policy_hash": policy.identity["policy_hash"],
         "identity": dict(identity),
     }
     return Subject(configuration, folder, args.task, args.env_keywords["heuristic"], training)
-
-
-def _validations(folder: Path) -> dict[int, dict[str, float]]:
-    """The metrics of a run at its validations, by decisions."""
-    rows: dict[int, dict[str, float]] = {}
-    with (folder / "metrics.csv").open(encoding="utf-8") as file:
-        for row in csv.DictReader(file):
-            if row["name"].startswith("validation/"):
-                kept = rows.setdefault(int(row["step"]), {})
-                kept |= {"grid_steps": int(row["grid_steps"]), "wall_time": float(row["wall_time"])}
-                kept[row["name"]] = float(row["value"])
-    if not rows:
-        raise UsageError(f"The run in {str(folder)!r} was never validated: only a best policy is tested.")
-    return rows
-
-
-def _train_command(args: RunArgs) -> str:
-    """The shortest command that makes the run again."""
-    words = ["rl2grid", "train", args.algorithm, args.task.removeprefix("rl2grid/").removesuffix("-v0")]
-    if args.env_keywords["heuristic"] is not None:
-        words += ["--heuristic", args.env_keywords["heuristic"]]
-    default = hyperparameters(args.algorithm, args.task)
-    for parameter in fields(default):
-        value = getattr(args.hyperparameters, parameter.name)
-        if value == getattr(default, parameter.name) or parameter.name in WITHOUT_INFLUENCE:
-            continue
-        flag = f"--{parameter.name.replace('_', '-')}"
-        if isinstance(value, bool):
-            words.append(flag if value else flag.replace("--", "--no-", 1))
-        elif isinstance(value, tuple):
-            words += [flag, *map(str, value)]
-        else:
-            words += [flag, str(value)]
-    if args.evaluate_every != RunArgs.evaluate_every:
-        words += ["--evaluate-every", str(args.evaluate_every)]
-    return shlex.join(words)
 
 
 def test(chosen: Subject) -> dict[str, Any]:

@@ -25,9 +25,8 @@ from rl2grid.analysis.results import EVALUATION_FILE, EvaluationResult, load_eva
 from rl2grid.engines import ENGINES
 from rl2grid.envs.registration import register_all
 from rl2grid.errors import UsageError
-from rl2grid.experiments import evaluation
 from rl2grid.experiments.episode import environment_seed, play_episode
-from rl2grid.experiments.evaluation import PARTIAL_FILE, evaluate, run_evaluation, validator
+from rl2grid.experiments.evaluation import PARTIAL_FILE, evaluate, run_evaluation
 from rl2grid.experiments.players import Job, Setting
 from rl2grid.experiments.runs import hyperparameters
 from rl2grid.grids import GRID_IDS
@@ -291,29 +290,9 @@ def test_bus14_rows_agree_with_the_environment(tmp_path, engine):
         assert (episode.survival == 1) == episode.completed == (episode.game_over == "NONE")
         weighted = episode.return_survive + 0.5 * episode.return_overload + 0.5 * episode.return_cost
         assert episode.episode_return == pytest.approx(weighted)
-    means = validator("bus14-T0", **options)(RandomAgent())
-    assert means["survival"] == result.summary.survival.value
-    assert means["episodic_return"] == result.summary.episode_return.value
-
-
-def test_validation_under_a_constraint_tells_how_often_it_is_kept(monkeypatch: pytest.MonkeyPatch):
-    played = evaluate(DoNothing(), "bus14-T0", scenarios=list_scenarios("bus14", "validation")[:1])
-    cases = [(True, 0.0, 50.0), (True, 0.0, 50.5), (False, 2.0, 10.0), (True, 0.0, 0.0)]
-    episodes = tuple(
-        replace(played.episodes[0], scenario=str(k), completed=completed, cost_lsi=lsi, cost_tlo=tlo)
-        for k, (completed, lsi, tlo) in enumerate(cases)
-    )
-    monkeypatch.setattr(evaluation, "evaluate", lambda *_, **__: replace(played, episodes=episodes))
-    for limits, share in (({"TLO": 50.0}, 0.5), ({"LSI": 2.0}, 0.75), ({"LSI": 2.0, "TLO": 50.5}, 0.75)):
-        assert validator("bus14-T0", limits=limits)(DoNothing())["safe_completed"] == share
-    assert validator("bus14-T0-TLO")(DoNothing())["safe_completed"] == 0.5
-    assert validator("bus14-R", constraint="LSI")(DoNothing())["safe_completed"] == 0.75
-    assert "safe_completed" not in validator("bus14-T0")(DoNothing())
 
 
 def test_a_constraint_that_contradicts_the_task_is_refused():
-    with pytest.raises(UsageError, match="contradicts task 'rl2grid/bus14-T0-LSI-v0': leave it out"):
-        validator("bus14-T0-LSI", constraint="TLO")
     with pytest.raises(UsageError, match="contradicts task"):
         evaluate(DoNothing(), "bus14-T0-LSI", constraint="TLO")
 

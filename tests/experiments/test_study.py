@@ -23,7 +23,7 @@ from rl2grid.experiments.study_backends import Local, Slurm
 from rl2grid.experiments.study_cell import BUSY, FAILED, FINISHED, REFUSED, CellResult, prepare, write_json
 from rl2grid.experiments.study_file import read_toml
 from rl2grid.experiments.study_run import MetricsTail, State, read_states, run_study
-from rl2grid.experiments.tuning import best_command, parse_tuning, run_tuning
+from rl2grid.experiments.tuning import Reports, best_command, one_score, parse_tuning, run_tuning
 
 GROUP: dict[str, Any] = {"algorithms": ["ppo"], "tasks": ["bus14-T0"]}
 
@@ -315,8 +315,39 @@ def test_a_search_finds_the_best_of_its_trials_and_is_gone_on_with(tmp_path: Pat
     assert best is not None
     stored = json.loads((tmp_path / "best.json").read_text())
     assert stored["survival"] == best.survival > 0.0
-    assert best_command(tuning, best).startswith("rl2grid train ppo bus14-T0-v0 --preset default --total-timesteps 512")
+    assert best_command(tuning, best).startswith("rl2grid train ppo bus14-T0 --total-timesteps 512")
     runs = set((tmp_path / "trials").iterdir())
     again = run_tuning(tuning, 1)
     assert again == best
     assert set((tmp_path / "trials").iterdir()) == runs
+
+
+def test_searches_under_constraints_look_for_safety_before_survival():
+    limits = {"TLO": 50.0}
+    ranked = [(0.5, 0.2), (0.5, 0.9), (0.55, 0.1), (1.0, 1.0)]
+    scores = [one_score({"safe_completed": safe, "survival": survival}, limits) for safe, survival in ranked]
+    assert scores == sorted(set(scores))
+    assert one_score({"survival": 0.7}, {}) == 0.7
+
+
+def test_a_trial_reports_its_best_so_far_and_what_it_reached_before_an_interruption(tmp_path: Path):
+    optuna = pytest.importorskip("optuna")
+
+    class Patient(optuna.pruners.BasePruner):
+        def prune(self, study: Any, trial: Any) -> bool:
+            return trial.last_step == 30
+
+    study = optuna.create_study(direction="maximize", pruner=Patient())
+    trial = study.ask()
+    rows = ["step,grid_steps,wall_time,name,value"]
+    for step, survival in ((10, 0.6), (20, 0.4)):
+        rows += [f"{step},0,0.0,validation/survival,{survival}", f"{step},0,0.0,losses/value_loss,9.0"]
+    (tmp_path / "metrics.csv").write_text("\n".join(rows) + "\n")
+    reports = Reports(trial, tmp_path, {})
+    assert reports.best == 0.6
+    with pytest.raises(optuna.TrialPruned):
+        reports.add(30, {"survival": 0.5})
+    reports.add(40, {"survival": 0.7})
+    told = study.get_trials()[0]
+    assert told.intermediate_values == {10: 0.6, 20: 0.6, 30: 0.6, 40: 0.7}
+    assert told.user_attrs["survival"] == 0.7

@@ -123,6 +123,23 @@ def read_training_run(folder: Path, label: str | None = None) -> TrainingRun:
     return TrainingRun(folder, task, settings, seed, read_training_curve(folder, name))
 
 
+def read_validations(folder: Path) -> dict[int, dict[str, float]]:
+    """What a run reached on the validation scenarios: means over episodes by decisions, then name.
+
+    Args:
+        folder: the run folder; without metrics there were no validations.
+    """
+    path, prefix = folder / METRICS_FILE, "validation/"
+    if not path.exists():
+        return {}
+    validations: dict[int, dict[str, float]] = {}
+    with path.open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            if row["name"].startswith(prefix):
+                validations.setdefault(int(row["step"]), {})[row["name"].removeprefix(prefix)] = float(row["value"])
+    return validations
+
+
 def group_curves(runs: Sequence[TrainingRun]) -> dict[str, dict[str, tuple[TrainingCurve, ...]]]:
     """Curves by task, then label, both in order of appearance.
 

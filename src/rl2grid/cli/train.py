@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import difflib
 import io
-from collections.abc import Callable, Mapping
 from dataclasses import Field, dataclass, fields, make_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,8 +14,7 @@ from rl2grid.errors import UsageError, one_of
 from rl2grid.experiments.limits import TimeLimit
 
 if TYPE_CHECKING:
-    from rl2grid.algorithms.policy_agent import PolicyAgent
-    from rl2grid.experiments.runs import Hyperparameters, RunArgs
+    from rl2grid.experiments.runs import Hyperparameters
 
 INTERRUPTED = 130
 """Exit status after an interrupt, as shells have it."""
@@ -104,13 +102,14 @@ def _resume(arguments: list[str]) -> int:
     if not arguments or arguments[0].startswith("-"):
         raise UsageError("Resuming needs one run folder, for example `rl2grid train --resume runs/bus14-T0-v0-ppo-1`.")
     from rl2grid.experiments import runs
+    from rl2grid.experiments.validation import validator
 
     path, flags = Path(arguments[0]), arguments[1:]
     _refuse_unknown(flags, [*fields(ResumeFlags)])
     own = _parse("rl2grid train --resume", flags, ResumeFlags())
     limit = TimeLimit(own.max_minutes)
     args, _ = runs.read_config(path)
-    folder = runs.resume(path, evaluate=_validator(args), limit=limit)
+    folder = runs.resume(path, evaluate=validator(args), limit=limit)
     return _report(folder, args.task, limit)
 
 
@@ -118,6 +117,7 @@ def _begin(algorithm: str, task_id: str, flags: list[str]) -> int:
     task = find_task(task_id)
     try:
         from rl2grid.experiments import runs
+        from rl2grid.experiments.validation import validator
     except ImportError as error:
         raise UsageError(f"Training needs {error.name}: install it with `pip install rl2grid[train]`.") from None
     if algorithm not in runs.ALGORITHMS:
@@ -141,7 +141,7 @@ def _begin(algorithm: str, task_id: str, flags: list[str]) -> int:
         evaluate_every=own.evaluate_every,
         wandb_project=own.wandb_project if own.track else None,
     )
-    folder = runs.train(args, evaluate=_validator(args) if own.validate else None, limit=limit)
+    folder = runs.train(args, evaluate=validator(args) if own.validate else None, limit=limit)
     return _report(folder, task.id, limit)
 
 
@@ -223,10 +223,3 @@ def _refuse_unknown(flags: list[str], known: list[Field[Any]]) -> None:
         close = difflib.get_close_matches(name, sorted(names), n=3)
         hint = f"did you mean {' or '.join(close)}?" if close else "see --help after the task for all flags."
         raise UsageError(f"Flag {name} does not exist: {hint}")
-
-
-def _validator(args: RunArgs) -> Callable[[PolicyAgent], Mapping[str, float]]:
-    from rl2grid.experiments.evaluation import validator
-    from rl2grid.experiments.runs import find_limits
-
-    return validator(args.task, limits=find_limits(args), engine=args.env_keywords["engine"], workers=args.num_workers)

@@ -21,8 +21,9 @@ from rl2grid.envs.registration import register_all
 from rl2grid.errors import UsageError
 from rl2grid.experiments import runs
 from rl2grid.experiments.agents import make_agent
-from rl2grid.experiments.evaluation import evaluate, validator
+from rl2grid.experiments.evaluation import evaluate
 from rl2grid.experiments.recording import record_episode
+from rl2grid.experiments.validation import validator
 from rl2grid.scenarios.library import list_scenarios
 
 TASK = "rl2grid/bus14-T0-v0"
@@ -87,12 +88,11 @@ def _contestants(run: Path) -> list[tuple[str, str | None]]:
 def _train(folder: Path, decisions: int) -> Path:
     """Begin the run, or go on with it; a complete run is left as it is."""
     hyperparameters = runs.hyperparameters("ppo", TASK, total_timesteps=decisions, num_envs=NUM_ENVS)
-    evaluate_policy = validator(TASK, heuristic=HEURISTIC)
     if folder.exists():
         stored, _ = runs.read_config(folder)
         if stored.hyperparameters != hyperparameters:
             raise UsageError(f"{folder} holds another training: remove it, or choose another folder with --output.")
-        return runs.resume(folder, evaluate=evaluate_policy)
+        return runs.resume(folder, evaluate=validator(stored))
     args = runs.RunArgs(
         task=TASK,
         hyperparameters=hyperparameters,
@@ -100,7 +100,7 @@ def _train(folder: Path, decisions: int) -> Path:
         env_keywords={"heuristic": HEURISTIC},
         evaluate_every=max(decisions // 8, 1),
     )
-    return runs.train(args, evaluate=evaluate_policy)
+    return runs.train(args, evaluate=validator(args))
 
 
 def _evaluate(agent: str, heuristic: str | None, output: Path) -> EvaluationResult:

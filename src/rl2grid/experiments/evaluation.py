@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -37,7 +37,6 @@ from rl2grid.experiments.agents import make_agent
 from rl2grid.experiments.episode import PlayedEpisode
 from rl2grid.experiments.players import Job, Progress, Setting, players
 from rl2grid.mdp.actions import action_set_hash
-from rl2grid.mdp.constraints import THRESHOLDS
 from rl2grid.scenarios.library import check_in_split, generator_version, list_scenarios, scenario_pack_hash
 from rl2grid.versions import library_versions
 
@@ -140,61 +139,6 @@ def run_evaluation(
         episodes = tuple(done[job] for job in jobs)
         store.finish(episodes)
     return EvaluationResult(episodes, identity, command, output)
-
-
-def validator(
-    task_id: str,
-    *,
-    seeds: Sequence[int] = (0,),
-    scenarios: Sequence[str] | None = None,
-    workers: int | None = None,
-    limits: Mapping[str, float] | None = None,
-    **options: Any,
-) -> Callable[[Agent], dict[str, float]]:
-    """A function that plays the validation scenarios with an agent and returns means over episodes.
-
-    It returns ``survival``, ``completed``, ``episodic_return``, ``cost_lsi``, ``cost_tlo`` and ``decisions``, and
-    under a constraint ``safe_completed``, P(cost ≤ threshold and episode completed): what picks the best policy while
-    one is trained.
-
-    Args:
-        task_id: id of the task; the namespace and the version may be left out.
-        seeds: as for :func:`evaluate`.
-        scenarios: as for :func:`evaluate`.
-        workers: as for :func:`evaluate`.
-        limits: threshold by constraint (``"LSI"``, ``"TLO"``), all of which a safe episode keeps; None: that of the
-            task's own constraint, if it has one.
-        options: as for :func:`evaluate`.
-
-    Raises:
-        UsageError: there is no such task.
-    """
-    constraint = constraint_of(find_task(task_id), options.get("constraint"))
-    kept = limits if limits is not None else {constraint: THRESHOLDS[constraint]} if constraint else {}
-
-    def validate(agent: Agent) -> dict[str, float]:
-        result = evaluate(agent, task_id, scenarios=scenarios, seeds=seeds, workers=workers, **options)
-        summary = result.summary
-        means = {
-            "survival": summary.survival.value,
-            "completed": summary.completed.value,
-            "episodic_return": summary.episode_return.value,
-            "cost_lsi": summary.cost_lsi.value,
-            "cost_tlo": summary.cost_tlo.value,
-            "decisions": summary.decisions.value,
-        }
-        return {**means, "safe_completed": _share_safe(result.episodes, kept)} if kept else means
-
-    return validate
-
-
-def _share_safe(episodes: Sequence[Episode], limits: Mapping[str, float]) -> float:
-    """Share of the episodes that were completed and kept all limits: dying early is not safety."""
-    safe = [
-        episode.completed and all(getattr(episode, f"cost_{name.lower()}") <= limit for name, limit in limits.items())
-        for episode in episodes
-    ]
-    return sum(safe) / len(safe)
 
 
 def env_keywords(agent: Agent, keywords: dict[str, Any]) -> dict[str, Any]:

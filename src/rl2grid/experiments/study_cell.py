@@ -33,8 +33,10 @@ from rl2grid.analysis.episodes import EPISODES_FILE
 from rl2grid.analysis.results import load_evaluation
 from rl2grid.errors import UsageError
 from rl2grid.experiments import runs
-from rl2grid.experiments.evaluation import evaluate, validator
+from rl2grid.experiments.commands import flags
+from rl2grid.experiments.evaluation import evaluate
 from rl2grid.experiments.study import Cell, Training, cell_from_dict, cell_to_dict
+from rl2grid.experiments.validation import validator
 
 CELL_FILE, RESULT_FILE, LOG_FILE, LOCK_FILE = "cell.json", "result.json", "log.txt", ".lock"
 RUN_FOLDER, EVALUATION_FOLDER = "run", "evaluation"
@@ -101,14 +103,13 @@ def commands(folder: Path, cell: Cell) -> list[str]:
     """What to type to obtain the cell by hand."""
     run, words = folder / RUN_FOLDER, ["rl2grid"]
     training = cell.training
-    environment = [_flag(name, value) for name, value in cell.environment.items()]
     lines = []
     if training is not None:
         train = [*words, "train", training.algorithm, cell.task, "--preset", training.preset]
         train += ["--seed", str(training.seed)]
         train += [] if cell.heuristic is None else ["--heuristic", cell.heuristic]
-        flags = [*environment, *(_flag(name, value) for name, value in training.hyperparameters.items())]
-        lines.append(shlex.join([*train, *(word for flag in flags for word in flag), "--folder", str(run)]))
+        train += flags({**cell.environment, **training.hyperparameters})
+        lines.append(shlex.join([*train, "--folder", str(run)]))
     agent = cell.agent if training is None else str(run)
     play = [*words, "evaluate", agent, cell.task, "--split", cell.split, "--seeds", str(cell.evaluation_seeds)]
     lines.append(shlex.join([*play, "--heuristic", cell.heuristic or "None"]))
@@ -159,12 +160,10 @@ def _finish(folder: Path) -> None:
 
 
 def _train(cell: Cell, training: Training, folder: Path) -> None:
-    evaluate_policy = validator(
-        cell.task, workers=0, scenarios=cell.scenarios("validation"), heuristic=cell.heuristic, **cell.environment
-    )
+    scenarios = cell.scenarios("validation")
     if folder.exists():
         if not runs.is_finished(folder):
-            runs.resume(folder, evaluate=evaluate_policy)
+            runs.resume(folder, evaluate=validator(runs.read_config(folder)[0], scenarios))
         return
     hyperparameters = training.resolved(cell.task)
     native = cell.environment.get("engine", "native") == "native"
@@ -179,7 +178,7 @@ def _train(cell: Cell, training: Training, folder: Path) -> None:
         evaluate_every=max(hyperparameters.total_timesteps // training.validations, 1),
         progress=False,
     )
-    runs.train(args, evaluate=evaluate_policy)
+    runs.train(args, evaluate=validator(args, scenarios))
 
 
 class CellProcess:
@@ -273,14 +272,6 @@ def write_json(path: Path, value: Any) -> None:
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     temporary.write_text(json.dumps(value, indent=2) + "\n", encoding="utf-8")
     os.replace(temporary, path)
-
-
-def _flag(name: str, value: Any) -> list[str]:
-    flag = name.replace("_", "-")
-    if isinstance(value, bool):
-        return [f"--{flag}" if value else f"--no-{flag}"]
-    values = value if isinstance(value, tuple | list) else (value,)
-    return [f"--{flag}", *map(str, values)]
 
 
 def _read_json(path: Path) -> Any:

@@ -22,7 +22,7 @@ import sys
 import time
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -32,16 +32,17 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from rl2grid.algorithms.policy_agent import PolicyAgent
-from rl2grid.analysis.training import VALIDATION
+from rl2grid.analysis.training import read_validations
 from rl2grid.engines import HEURISTICS
 from rl2grid.envs.tasks import find_task
 from rl2grid.errors import UsageError
 from rl2grid.experiments import runs
-from rl2grid.experiments.evaluation import validator
+from rl2grid.experiments.commands import train_command
 from rl2grid.experiments.interrupts import stop_requests
 from rl2grid.experiments.study import NO_HEURISTIC, evenly_spread
-from rl2grid.experiments.study_cell import METRICS_FILE, STOPPED, CellProcess, is_busy, serve, write_json
+from rl2grid.experiments.study_cell import STOPPED, CellProcess, is_busy, serve, write_json
 from rl2grid.experiments.study_file import as_table, count, read_toml, refuse_unknown_keys, text, unknown
+from rl2grid.experiments.validation import validator
 
 TUNING_FILE, JOURNAL_FILE, BEST_FILE = "tuning.json", "journal.log", "best.json"
 TRIALS_FOLDER = "trials"
@@ -114,6 +115,7 @@ class Best:
 
     trial: int
     survival: float
+    """Of its best policy by validation; under constraints that is the one most often safe."""
     hyperparameters: Mapping[str, Any]
     """Those that were searched."""
 
@@ -213,20 +215,9 @@ def run_tuning(
 
 def best_command(tuning: Tuning, best: Best) -> str:
     """What to type to train with a configuration."""
-    words = ["rl2grid", "train", tuning.algorithm, tuning.task.removeprefix("rl2grid/"), "--preset", tuning.preset]
-    words += ["--heuristic", tuning.heuristic] if tuning.heuristic else []
-    resolved = tuning.resolved(best.hyperparameters)
-    preset = runs.hyperparameters(tuning.algorithm, tuning.task, tuning.preset)
-    for field in fields(preset):
-        value = getattr(resolved, field.name)
-        if value == getattr(preset, field.name):
-            continue
-        flag = field.name.replace("_", "-")
-        if isinstance(value, bool):
-            words.append(f"--{flag}" if value else f"--no-{flag}")
-            continue
-        words += [f"--{flag}", *map(str, value if isinstance(value, tuple) else (value,))]
-    return " ".join(words)
+    args = _run_args(tuning, tuning.resolved(best.hyperparameters), None)
+    # Not as often validated as while searching, where that is for ending poor trials.
+    return train_command(replace(args, evaluate_every=runs.RunArgs.evaluate_every), tuning.preset)
 
 
 def work(folder: Path) -> None:
@@ -241,15 +232,15 @@ def work(folder: Path) -> None:
     while sum(trial.state in begun for trial in study.get_trials(deepcopy=False)) < tuning.trials:
         trial = study.ask()
         try:
-            survival = _train(tuning, trial)
+            reached = _train(tuning, trial)
         except optuna.TrialPruned:
             study.tell(trial, state=optuna.trial.TrialState.PRUNED)
         else:
-            study.tell(trial, survival)
+            study.tell(trial, reached)
 
 
 def _train(tuning: Tuning, trial: Any) -> float:
-    """Train one configuration; returns its best validation survival."""
+    """Train one configuration; returns its best score in validation."""
     optuna = _optuna()
     chosen = {name: _suggest(trial, name, values) for name, values in tuning.space.items()}
     try:
@@ -259,27 +250,17 @@ def _train(tuning: Tuning, trial: Any) -> float:
         raise optuna.TrialPruned from None
     folder = _trial_folder(tuning, chosen)
     trial.set_user_attr("run", folder.name)
-    reports = _Reports(trial, folder)
     scenarios = evenly_spread(tuning.task, "validation", tuning.months)
-    validate = validator(tuning.task, workers=0, scenarios=scenarios)
+    args = _run_args(tuning, hyperparameters, folder)
+    validate = validator(args, scenarios)
+    reports = Reports(trial, folder, runs.find_limits(args))
 
     def report(agent: PolicyAgent) -> Mapping[str, float]:
         result = validate(agent)
-        reports.add(agent.identity["decisions"], result["survival"])
+        reports.add(agent.identity["decisions"], result)
         return result
 
     if not folder.exists():
-        args = runs.RunArgs(
-            task=tuning.task,
-            hyperparameters=hyperparameters,
-            algorithm=tuning.algorithm,
-            folder=folder,
-            env_keywords={"heuristic": tuning.heuristic},
-            num_threads=1,
-            evaluate_every=max(tuning.budget // tuning.validations, 1),
-            tensorboard=False,
-            progress=False,
-        )
         runs.train(args, evaluate=report)
     elif not runs.is_finished(folder):
         runs.resume(folder, evaluate=report)
@@ -288,38 +269,59 @@ def _train(tuning: Tuning, trial: Any) -> float:
     return reports.best
 
 
-class _Reports:
+def _run_args(tuning: Tuning, hyperparameters: runs.Hyperparameters, folder: Path | None) -> runs.RunArgs:
+    return runs.RunArgs(
+        task=tuning.task,
+        hyperparameters=hyperparameters,
+        algorithm=tuning.algorithm,
+        folder=folder,
+        env_keywords={"heuristic": tuning.heuristic},
+        num_threads=1,
+        evaluate_every=max(tuning.budget // tuning.validations, 1),
+        tensorboard=False,
+        progress=False,
+    )
+
+
+class Reports:
     """What a trial tells of its course, that before an interruption included."""
 
-    def __init__(self, trial: Any, folder: Path) -> None:
+    def __init__(self, trial: Any, folder: Path, limits: Mapping[str, float]) -> None:
         self._trial = trial
+        self._limits = limits
         self._told: set[int] = set()
         self.best = -math.inf
-        for decisions, survival in _validations(folder / METRICS_FILE):
-            self._tell(decisions, survival)
+        """See :func:`one_score`."""
+        for decisions, means in read_validations(folder).items():
+            self._tell(decisions, means)
 
-    def add(self, decisions: int, survival: float) -> None:
+    def add(self, decisions: int, means: Mapping[str, float]) -> None:
         """Report a validation.
 
         Raises:
             optuna.TrialPruned: others were better by then.
         """
-        self._tell(decisions, survival)
+        self._tell(decisions, means)
         if self._trial.should_prune():
             raise _optuna().TrialPruned
 
-    def _tell(self, decisions: int, survival: float) -> None:
-        self.best = max(self.best, survival)
+    def _tell(self, decisions: int, means: Mapping[str, float]) -> None:
+        reached = one_score(means, self._limits)
+        if reached >= self.best:
+            self.best = reached
+            self._trial.set_user_attr("survival", float(means["survival"]))
         if decisions not in self._told:
             self._told.add(decisions)
             self._trial.report(self.best, decisions)
 
 
-def _validations(path: Path) -> list[tuple[int, float]]:
-    if not path.exists():
-        return []
-    rows = (line.split(",") for line in path.read_text(encoding="utf-8").splitlines()[1:])
-    return [(int(row[0]), float(row[4])) for row in rows if len(row) == 5 and row[3] == VALIDATION]
+def one_score(means: Mapping[str, float], limits: Mapping[str, float]) -> float:
+    """:func:`rl2grid.experiments.runs.score` as one number in the same order, as searches need it.
+
+    Shares of safe episodes of fewer than 1,000 episodes differ by more than the last weight.
+    """
+    first, *then = runs.score(means, limits)
+    return first + sum(1e-3 * value for value in then)
 
 
 def _suggest(trial: Any, name: str, values: Any) -> Any:
@@ -377,7 +379,7 @@ def _best(tuning: Tuning) -> Best | None:
         else value
         for name, value in trial.params.items()
     }
-    return Best(trial.number, float(trial.value), chosen)
+    return Best(trial.number, trial.user_attrs["survival"], chosen)
 
 
 def _prepare(tuning: Tuning) -> None:
@@ -459,8 +461,8 @@ def _progress(tuning: Tuning, console: Console | None) -> Iterator[Any]:
         def show(study: Any) -> None:
             trials = study.get_trials(deepcopy=False)
             ended = [trial for trial in trials if trial.state.name in ("COMPLETE", "PRUNED")]
-            values = [trial.value for trial in ended if trial.state.name == "COMPLETE"]
-            best = f"best {max(values):.3f}, " if values else ""
+            best_so_far = _best(tuning)
+            best = f"best survival {best_so_far.survival:.3f}, " if best_so_far else ""
             pruned = sum(trial.state.name == "PRUNED" for trial in ended)
             minutes = (time.monotonic() - began) / 60.0
             bar.update(task, completed=len(ended), best=f"{best}{pruned} ended early, {minutes:.0f} min")

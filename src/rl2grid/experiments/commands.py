@@ -1,0 +1,47 @@
+"""What to type to make a training run again."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+from rl2grid.envs.tasks import TaskOptions
+from rl2grid.experiments import runs
+
+WITHOUT_INFLUENCE = frozenset({"torch_threads", "device"})
+"""Hyperparameters that say where is computed, not what."""
+
+
+def train_command(args: runs.RunArgs, preset: str = "default") -> str:
+    """The shortest ``rl2grid train`` that makes a run again: everything that its preset does not say.
+
+    Args:
+        args: the run.
+        preset: where its hyperparameters came from.
+    """
+    words = ["rl2grid", "train", args.algorithm, args.task.removeprefix("rl2grid/").removesuffix("-v0")]
+    words += ["--preset", preset] if preset != "default" else []
+    defaults = asdict(TaskOptions())
+    keywords = {name: value for name, value in args.env_keywords.items() if value != defaults[name]}
+    chosen, original = asdict(args.hyperparameters), asdict(runs.hyperparameters(args.algorithm, args.task, preset))
+    changes = {name: value for name, value in chosen.items() if value != original[name]}
+    for name in WITHOUT_INFLUENCE & set(changes):
+        del changes[name]
+    words += flags({**keywords, **changes})
+    if args.evaluate_every != runs.RunArgs.evaluate_every:
+        words += ["--evaluate-every", str(args.evaluate_every)]
+    return shlex.join(words)
+
+
+def flags(values: Mapping[str, Any]) -> list[str]:
+    """Flags of the command line that set values, by name."""
+    words = []
+    for name, value in values.items():
+        flag = name.replace("_", "-")
+        if isinstance(value, bool):
+            words.append(f"--{flag}" if value else f"--no-{flag}")
+            continue
+        words += [f"--{flag}", *map(str, value if isinstance(value, tuple | list) else (value,))]
+    return words

@@ -1,0 +1,56 @@
+"""Validation: what picks the best policy of a run while it is trained."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from rl2grid.algorithms.policy_agent import PolicyAgent
+from rl2grid.analysis.episodes import Episode
+from rl2grid.experiments import runs
+from rl2grid.experiments.evaluation import evaluate
+
+OF_TRAINING = ("split", "scenario", "gamma", "reward")
+"""Keywords of the training environments that validation does not take over."""
+
+
+def validator(args: runs.RunArgs, scenarios: Sequence[str] | None = None) -> runs.Evaluate:
+    """A function that plays the validation scenarios as the run plays its own and returns means over episodes.
+
+    It returns ``survival``, ``completed``, ``episodic_return``, ``cost_lsi``, ``cost_tlo`` and ``decisions``, and
+    under constraints ``safe_completed``, P(cost ≤ threshold and episode completed) with the thresholds of
+    :func:`rl2grid.experiments.runs.find_limits`.
+
+    Args:
+        args: the run: its task, its keywords of the environment and its number of processes are those of validation,
+            with the default rewards.
+        scenarios: play these only; None: all of the split.
+
+    Raises:
+        UsageError: the run cannot be constrained as asked.
+    """
+    limits = runs.find_limits(args)
+    keywords = {name: value for name, value in args.env_keywords.items() if name not in OF_TRAINING}
+
+    def validate(agent: PolicyAgent) -> dict[str, float]:
+        result = evaluate(agent, args.task, scenarios=scenarios, workers=args.num_workers, **keywords)
+        summary = result.summary
+        means = {
+            "survival": summary.survival.value,
+            "completed": summary.completed.value,
+            "episodic_return": summary.episode_return.value,
+            "cost_lsi": summary.cost_lsi.value,
+            "cost_tlo": summary.cost_tlo.value,
+            "decisions": summary.decisions.value,
+        }
+        return {**means, "safe_completed": _share_safe(result.episodes, limits)} if limits else means
+
+    return validate
+
+
+def _share_safe(episodes: Sequence[Episode], limits: Mapping[str, float]) -> float:
+    """Share of the episodes that were completed and kept all limits: dying early is not safety."""
+    safe = [
+        episode.completed and all(getattr(episode, f"cost_{name.lower()}") <= limit for name, limit in limits.items())
+        for episode in episodes
+    ]
+    return sum(safe) / len(safe)

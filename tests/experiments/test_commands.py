@@ -1,0 +1,55 @@
+"""Commands: typed again, they ask for the same run."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from rl2grid.cli import train as command
+from rl2grid.envs.tasks import find_task
+from rl2grid.experiments import runs
+from rl2grid.experiments.commands import flags, train_command
+
+CASES: list[tuple[str, str, str, dict[str, Any], dict[str, Any]]] = [
+    ("ppo", "bus14-T0", "default", {}, {}),
+    ("ppo", "bus14-T0", "default", {"seed": 3, "num_envs": 4, "actor_layers": (8, 16)}, {"heuristic": "idle"}),
+    ("sac", "bus14-R", "paper", {"gamma": 0.95}, {"maintenance": False, "dispatch": "grid2op", "constraint": "TLO"}),
+    ("dqn", "bus36-M-T0", "default", {"mask_actions": False, "huber_delta": None}, {"reward": "paper"}),
+    ("lagrangian-ppo", "bus14-T0-TLO", "default", {"thresholds": (20.0,), "constraints": ("TLO",)}, {}),
+]
+
+
+@pytest.mark.parametrize(("algorithm", "task", "preset", "changes", "keywords"), CASES)
+def test_a_command_asks_for_the_run_that_it_was_made_from(
+    algorithm: str,
+    task: str,
+    preset: str,
+    changes: dict[str, Any],
+    keywords: dict[str, Any],
+    monkeypatch: pytest.MonkeyPatch,
+):
+    chosen = runs.hyperparameters(algorithm, task, preset, **changes)
+    args = runs.RunArgs(find_task(task).id, chosen, algorithm=algorithm, env_keywords=keywords, evaluate_every=700)
+    asked: list[runs.RunArgs] = []
+    monkeypatch.setattr(runs, "train", lambda args, **_: asked.append(args))
+    monkeypatch.setattr(command, "_report", lambda *_: 0)
+    words = shlex.split(train_command(args, preset))
+    assert words[:2] == ["rl2grid", "train"]
+    command.train(words[2:])
+    (typed,) = asked
+    assert typed.hyperparameters == args.hyperparameters
+    assert {name: typed.env_keywords[name] for name in keywords} == keywords
+    assert replace(typed, env_keywords=keywords) == args
+
+
+def test_what_has_no_influence_on_results_is_left_out():
+    args = runs.RunArgs("rl2grid/bus14-T0-v0", runs.hyperparameters("ppo", "bus14-T0", torch_threads=2))
+    assert train_command(args) == "rl2grid train ppo bus14-T0"
+
+
+def test_flags_of_all_kinds_of_values():
+    values = {"num_envs": 3, "mask_actions": False, "opponent": True, "layers": [8, 16]}
+    assert flags(values) == ["--num-envs", "3", "--no-mask-actions", "--opponent", "--layers", "8", "16"]
