@@ -90,6 +90,11 @@ def test_a_bad_file_is_refused_in_one_sentence(changes: dict[str, Any], part: st
     assert "\n" not in str(refusal.value)
 
 
+def test_greedy_search_plays_tasks_of_both_kinds():
+    group = {"algorithms": [], "agents": ["greedy", "greedy-n1"], "tasks": ["bus14-T0", "bus14-R"]}
+    assert len(parse_study(contents(group=group)).cells) == 4
+
+
 @pytest.mark.parametrize("name", sorted(included_studies()))
 def test_included_studies_are_valid_at_every_scale(name: str):
     file = read_toml(included_studies()[name])

@@ -101,7 +101,7 @@ def _tasks(options: argparse.Namespace) -> int:
 def _add_evaluate(commands: argparse._SubParsersAction[_Parser]) -> None:
     parser = commands.add_parser("evaluate", help="play agents on enumerated scenarios, one row per episode")
     parser.add_argument(
-        "agent", help="do-nothing, random, recovery, greedy, milp, dc-opf, or a run folder or checkpoint"
+        "agent", help="do-nothing, random, recovery, greedy, greedy-n1, milp, dc-opf, or a run folder or checkpoint"
     )
     parser.add_argument("task", help="for example bus14-T0")
     parser.add_argument("--split", default="validation", choices=SPLITS, help="validation picks models; test is last")

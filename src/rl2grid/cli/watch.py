@@ -26,7 +26,7 @@ def add_parser(commands: Any) -> None:
     """Add the subcommand to those of ``rl2grid``."""
     parser = commands.add_parser("watch", help="play one episode and make it visible: a page, an animation")
     parser.add_argument(
-        "agent", help="do-nothing, random, recovery, greedy, milp, dc-opf, or a run folder or checkpoint"
+        "agent", help="do-nothing, random, recovery, greedy, greedy-n1, milp, dc-opf, or a run folder or checkpoint"
     )
     parser.add_argument("task", help="for example bus14-T0")
     parser.add_argument("--split", default="validation", choices=SPLITS)

@@ -54,7 +54,7 @@ NO_HEURISTIC = "none"
 DEFAULT_RETRIES = 2
 DEFAULT_VALIDATIONS = 10
 
-_AGENT_KINDS = {"recovery": "T", "greedy": "T", "milp": "T", "dc-opf": "R"}
+_AGENT_KINDS = {"recovery": "T", "milp": "T", "dc-opf": "R"}
 """Kinds of task that agents without training can play, where it is not both."""
 _ACTIONS = {"T": "discrete", "R": "continuous"}
 
