@@ -1,5 +1,6 @@
 """Generated months: named, made once, kept, repaired, and never trained on where they are held out."""
 
+import itertools
 import shutil
 import threading
 from dataclasses import replace
@@ -126,6 +127,7 @@ def test_processes_make_the_same_packs(made) -> None:
 
 def test_only_the_latest_expanded_months_are_kept_and_mapped_ones_stay_readable(made, monkeypatch) -> None:
     monkeypatch.setattr(generated, "EXPANDED_BYTES", 1)
+    monkeypatch.setattr(generated, "MONTHS_BETWEEN_CLEANUPS", 1)
     first = load_scenario("bus14", "generated/17-03")
     total = first.load_p.sum()
     load_scenario("bus14", "generated/17-04")
@@ -133,6 +135,16 @@ def test_only_the_latest_expanded_months_are_kept_and_mapped_ones_stay_readable(
     assert sorted(name.rpartition(".")[2] for name in kept) == ["json", "lock", "npy"]
     assert all(name.startswith("generated.17-04-") for name in kept)
     assert first.load_p.sum() == total
+
+
+def test_months_to_remove_are_looked_for_when_some_were_expanded_not_at_every_episode(made, monkeypatch) -> None:
+    looked: list[int] = []
+    monkeypatch.setattr(generated, "_remove_oldest", lambda paths, limit: looked.append(len(paths)))
+    monkeypatch.setattr(generated, "_EXPANDED_MONTHS", itertools.count())
+    monkeypatch.setattr(generated, "MONTHS_BETWEEN_CLEANUPS", 2)
+    for month in (3, 4, 3, 3, 5, 3):
+        load_scenario("bus14", f"generated/17-{month:02d}")
+    assert looked == [1, 3]
 
 
 def test_training_keeps_whole_years_and_forgets_the_oldest(made, monkeypatch) -> None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import itertools
 import multiprocessing
 import re
 import signal
@@ -47,6 +48,9 @@ own): making one month takes as long as making its year, and environments of a v
 
 EXPANDED_BYTES = 8 * 2**30
 """Expanded generated months beyond this are removed, oldest first; they are expanded again when needed."""
+MONTHS_BETWEEN_CLEANUPS = 50
+"""A process looks for months to remove after the first one that it expands, then each time after so many more: to look
+at thousands of files takes longer than to play an episode."""
 TRAINING_PACK_BYTES = 2 * 2**30
 """Packs of a grid's training years beyond this are removed, oldest first."""
 
@@ -55,6 +59,8 @@ _POWER_FLOW = ("ac", "bits", "borrowing", "factors", "flow_state", "model", "new
 
 _NAME = re.compile(r"(?P<seed>0|[1-9]\d{0,18})-(?P<month>\d\d)(\+(?P<next>\d\d))?")
 _LOCKS = 64
+_EXPANDED_MONTHS = itertools.count()
+"""How many this process has expanded so far."""
 
 
 class Months(NamedTuple):
@@ -113,8 +119,16 @@ def load_generated(grid: Grid, name: str) -> CachedSeries:
         UsageError: There are no such months, or the data folder cannot be written.
     """
     months = parse_months(name)
-    series = cached_series(grid.id, f"generated.{name}", generator_fingerprint(grid), lambda: _content(grid, months))
-    _remove_oldest([*(data_folder() / "series" / f"v{FORMAT_VERSION}").glob("*/generated.*.npy")], EXPANDED_BYTES)
+    expanded = False
+
+    def expand() -> FolderContent:
+        nonlocal expanded
+        expanded = True
+        return _content(grid, months)
+
+    series = cached_series(grid.id, f"generated.{name}", generator_fingerprint(grid), expand)
+    if expanded and next(_EXPANDED_MONTHS) % MONTHS_BETWEEN_CLEANUPS == 0:
+        _remove_oldest([*(data_folder() / "series" / f"v{FORMAT_VERSION}").glob("*/generated.*.npy")], EXPANDED_BYTES)
     return series
 
 
@@ -202,11 +216,6 @@ def _content(grid: Grid, months: Months) -> FolderContent:
     from rl2grid.scenarios.generator import month as generator
 
     raw = _read_or_make(grid, months.seed, months.numbers)
-    if is_training_seed(months.seed):
-        _remove_oldest(
-            [path for path in pack_folder(grid).glob("*.pack") if is_training_seed(_seed_of(path))],
-            TRAINING_PACK_BYTES,
-        )
     parts = [generator.arrays_of(grid, each) for each in raw]
     if len(parts) == 1:
         return FolderContent(generator.start_of(raw[0]), _in_order(parts[0]))
@@ -230,11 +239,15 @@ def _read_or_make(grid: Grid, seed: int, months: Sequence[int]) -> list[RawMonth
         folder.mkdir(parents=True, exist_ok=True)
         with filelock.FileLock(folder / f"{seed % _LOCKS:02d}.lock"):
             _make_missing(grid, seed, months)
-            return [_read_back(pack_path(grid, seed, month)) for month in months]
+            made = [_read_back(pack_path(grid, seed, month)) for month in months]
     except OSError as error:
         raise UsageError(
             f"The data folder {data_folder()} cannot be written ({error}): set RL2GRID_DATA to one that can."
         ) from error
+    if is_training_seed(seed):
+        packs = [path for path in folder.glob("*.pack") if is_training_seed(_seed_of(path))]
+        _remove_oldest(packs, TRAINING_PACK_BYTES)
+    return made
 
 
 def _make_missing(grid: Grid, seed: int, months: Sequence[int]) -> None:
