@@ -82,6 +82,42 @@ def test_losses_by_hand():
     assert float(loss(values, aims, 2.0)) == pytest.approx((0.25 + 0.0 + 2.0 * (6.0 - 2.0)) / 3)
 
 
+def test_a_dueling_head_adds_advantages_without_their_mean_to_the_value_of_the_state():
+    network = QNetwork(1, 3, (), torch.Generator().manual_seed(0), head="dueling")
+    (layer,) = network.networks[0]
+    with torch.no_grad():
+        layer.weight[:] = torch.tensor([[1.0], [0.0], [2.0], [4.0]])
+        layer.bias[:] = torch.tensor([10.0, 3.0, 0.0, 0.0])
+    # At observation 1: V = 11, A = (3, 2, 4), whose mean is 3.
+    assert network(torch.tensor([[1.0]])).tolist() == [[11.0, 10.0, 12.0]]
+
+
+def test_of_several_networks_the_least_value_counts():
+    network = QNetwork(1, 2, (), torch.Generator().manual_seed(0), count=2)
+    with torch.no_grad():
+        for (layer,), biases in zip(network.networks, ([1.0, 5.0], [3.0, 2.0]), strict=True):
+            layer.weight[:] = 0.0
+            layer.bias[:] = torch.tensor(biases)
+    observations = torch.zeros(3, 1)
+    assert network.each(observations)[:, 0].tolist() == [[1.0, 5.0], [3.0, 2.0]]
+    assert network(observations).tolist() == [[1.0, 2.0]] * 3
+    assert network.act(observations, None, None).tolist() == [1, 1, 1]
+    following = batch(actions=torch.zeros(3, dtype=torch.int64))
+    assert targets(network, network, following).tolist() == pytest.approx([1.0 + 0.9 * 2.0, 2.0 + 0.9**3 * 2.0, 3.0])
+
+
+def test_several_networks_learn_independently_from_one_target():
+    dqn = DQN(replace(SMALL, networks=2, huber_delta=None), ToyGrid(4))
+    transitions = batch(observations=torch.randn(3, 4), next_observations=torch.randn(3, 4))
+    aims = targets(dqn.network, dqn.target, transitions)
+    before = dqn.network.each(transitions.observations).detach()
+    expected = sum(float(((each[range(3), range(3)] - aims) ** 2).mean()) for each in before)
+    metrics = dqn.learn(transitions)
+    assert float(metrics["losses/qf_loss"].detach()) == pytest.approx(expected, rel=1e-5)
+    first, second = (network[-1].weight for network in dqn.network.networks)
+    assert not torch.equal(first, second)
+
+
 def test_only_the_values_of_actions_played_are_moved():
     dqn = DQN(replace(SMALL, huber_delta=None), ToyGrid(4))
     transitions = Batch(
@@ -97,7 +133,7 @@ def test_only_the_values_of_actions_played_are_moved():
     metrics = dqn.learn(transitions)
     assert float(metrics["losses/qf_loss"].detach()) == pytest.approx((before - 1.0) ** 2, rel=1e-5)
     assert float(metrics["losses/qf_values"].detach()) == pytest.approx(before)
-    gradient = dqn.network.network[-1].bias.grad
+    gradient = dqn.network.networks[0][-1].bias.grad
     assert gradient.tolist() == pytest.approx([0.0, 0.0, 2.0 * (before - 1.0)], rel=1e-5)
 
 
@@ -114,8 +150,8 @@ def test_epsilon_falls_linearly_in_decisions_and_stays():
 def test_random_actions_are_as_frequent_as_epsilon_says(epsilon: float):
     dqn = DQN(replace(SMALL, first_epsilon=epsilon, last_epsilon=epsilon), ToyGrid(4))
     with torch.no_grad():
-        dqn.network.network[-1].bias[2] = 100.0
-        dqn.network.network[-1].bias[1] = 200.0
+        dqn.network.networks[0][-1].bias[2] = 100.0
+        dqn.network.networks[0][-1].bias[1] = 200.0
     masks = torch.tensor([[True, False, True]]).expand(20_000, 3)
     shares = dqn.explore(torch.zeros(20_000, 4), masks).bincount(minlength=3) / 20_000
     np.testing.assert_allclose(shares, [epsilon / 2, 0.0, 1.0 - epsilon / 2], atol=0.015)

@@ -522,7 +522,8 @@ def _expected(kind: str, one: Any) -> Callable[[torch.Tensor, torch.Tensor], Any
             return one.actor.network(observation).tanh()
         if kind == "sac-continuous":
             return one.actor.network(observation)[:2].tanh()
-        outputs = one.policy()[0].network(observation)
+        policy = one.policy()[0]
+        outputs = policy.networks[0](observation) if kind == "dqn" else policy.network(observation)
         legal = mask.nonzero().squeeze(-1)
         return int(legal[outputs[legal].argmax()])
 

@@ -11,6 +11,13 @@ Targets
     decisions pass a multiple of ``target_frequency``. The environment tells no legal actions for the last
     observation of a completed month; there they are taken to be those of the last decision.
 
+    With several networks, each fits the same y, and Q is the least of their values wherever an action is chosen
+    or judged (clipped double Q-learning; Fujimoto et al., 2018).
+
+    With the dueling head (Wang et al., 2016) the last layer gives V and A, one number per action, and
+    Q(s, a) = V(s) + A(s, a) - mean over all a' of A(s, a'): what every action shows of a state is learned at
+    once, and what remains to be told apart is small.
+
 Exploration
     With probability epsilon, which falls linearly over the first decisions of the run, an action is drawn
     among the legal ones; else the legal action of the highest value is played. The deterministic policy is
@@ -39,6 +46,9 @@ from rl2grid.algorithms.off_policy import (
 )
 from rl2grid.errors import UsageError, one_of
 
+SINGLE, DUELING = "single", "dueling"
+HEADS = (SINGLE, DUELING)
+
 # --- Hyperparameters ------------------------------------------------------------------------------------------------
 
 
@@ -64,34 +74,44 @@ class Args(OffPolicyArgs):
     """Errors beyond this count linearly instead of squared (Huber's loss); None: all are squared."""
     layers: tuple[int, ...] = (128, 128)
     """Widths of the network's hidden layers (ReLU)."""
+    head: str = SINGLE
+    """How values come out of a network: ``single``, one per action, or ``dueling`` (equation above)."""
+    networks: int = 1
+    """Networks that learn independently, the least of whose values counts (clipped double Q-learning)."""
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work; see :class:`OffPolicyArgs`."""
         super().__post_init__()
-        self._check_counts("target_frequency")
+        self._check_counts("target_frequency", "networks")
         self._check_positive("learning_rate")
         self._check_shares("first_epsilon", "last_epsilon", "epsilon_decay_fraction")
         if self.exploration_do_nothing is not None:
             self._check_shares("exploration_do_nothing")
         if self.huber_delta is not None:
             self._check_positive("huber_delta")
+        if self.head not in HEADS:
+            raise one_of("DQN's head", self.head, HEADS)
 
 
 def default(*, continuous: bool) -> Args:
     """Our own values, for tasks with a heuristic on a small machine.
 
     Many random actions do nothing: at random, one of the first few actions would already cut the grid apart, and
-    little would be seen of what comes later. Step size and renewals are slow: the best of many values is easily
-    one that is too high, and the next target would be built on it.
+    little would be seen of what comes later. With one network the values grow beyond any return that is possible, as
+    the best of many values is easily one that is too high and the next target is built on it; the least value of
+    four does not, and what is tried is then worth trying, so that few random actions are needed.
     """
     _refuse_continuous(continuous)
     return Args(
-        learning_rate=1e-4,
-        target_frequency=8_000,
-        last_epsilon=0.01,
-        epsilon_decay_fraction=0.6,
-        exploration_do_nothing=0.3,
+        num_envs=32,
+        learning_rate=1e-3,
+        target_frequency=1_000,
+        first_epsilon=0.2,
+        last_epsilon=0.02,
+        exploration_do_nothing=0.5,
         huber_delta=1.0,
+        head=DUELING,
+        networks=4,
     )
 
 
@@ -166,16 +186,27 @@ class QNetwork(nn.Module):
         action_size: int,
         layers: Sequence[int],
         generator: torch.Generator | None = None,
+        head: str = SINGLE,
+        count: int = 1,
     ) -> None:
         super().__init__()
         self.observation_size = observation_size
         self.action_size = action_size
-        self.network = make_network(observation_size, layers, action_size, generator)
+        self.dueling = head == DUELING
+        outputs = action_size + self.dueling
+        self.networks = nn.ModuleList(make_network(observation_size, layers, outputs, generator) for _ in range(count))
 
     def forward(self, observations: Tensor) -> Tensor:
-        """Q of observations [batch, size] -> [batch, actions]."""
-        values: Tensor = self.network(observations)
-        return values
+        """Q of observations [batch, size] -> [batch, actions]: the least of what the networks say."""
+        return self.each(observations).min(dim=0).values
+
+    def each(self, observations: Tensor) -> Tensor:
+        """What every network says of observations [batch, size] -> [networks, batch, actions]."""
+        outputs = torch.stack([network(observations) for network in self.networks])
+        if not self.dueling:
+            return outputs
+        value, advantages = outputs[..., :1], outputs[..., 1:]
+        return value + advantages - advantages.mean(dim=-1, keepdim=True)
 
     def act(self, observations: Tensor, masks: Tensor | None, generator: torch.Generator | None) -> Tensor:
         """The best legal actions for observations [batch, size], int64 [batch]; ``generator`` has nothing to draw."""
@@ -191,7 +222,8 @@ def best_actions(values: Tensor, masks: Tensor | None) -> Tensor:
 
 def load_policy(state: Mapping[str, Any]) -> QNetwork:
     """The network of a checkpoint's section ``policy``."""
-    network = QNetwork(state["observation_size"], state["action_size"], state["layers"])
+    sizes = (state["observation_size"], state["action_size"], state["layers"])
+    network = QNetwork(*sizes, head=state["head"], count=state["networks"])
     network.load_state_dict(state["network"])
     return network
 
@@ -230,7 +262,8 @@ class DQN(OffPolicyTrainer):
         """
         super().__init__(args, envs)
         _refuse_continuous(self.continuous)
-        self.network = QNetwork(self.observation_size, self.action_size, args.layers, self.generator).to(self.device)
+        sizes = (self.observation_size, self.action_size, args.layers)
+        self.network = QNetwork(*sizes, self.generator, args.head, args.networks).to(self.device)
         self.target = copy.deepcopy(self.network)
         self.optimizer = adam(self.network, args.learning_rate)
         self._renewals = 0
@@ -256,8 +289,9 @@ class DQN(OffPolicyTrainer):
     def learn(self, batch: Batch) -> dict[str, Tensor]:
         """Fit the values of the actions played to their targets; renew the target network when due."""
         aims = targets(self.network, self.target, batch)
-        values = self.network(batch.observations).gather(-1, batch.actions.unsqueeze(-1)).squeeze(-1)
-        error = loss(values, aims, self.args.huber_delta)
+        played = batch.actions.expand(self.args.networks, -1).unsqueeze(-1)
+        values = self.network.each(batch.observations).gather(-1, played).squeeze(-1)
+        error = torch.stack([loss(each, aims, self.args.huber_delta) for each in values]).sum()
         self._descend(self.optimizer, error, self.network)
         renewals = self.decisions // self.args.target_frequency
         if renewals > self._renewals:
@@ -275,7 +309,7 @@ class DQN(OffPolicyTrainer):
 
     def policy(self) -> tuple[nn.Module, dict[str, Any]]:
         """See :class:`OffPolicyTrainer`."""
-        return self.network, {"layers": list(self.args.layers)}
+        return self.network, {"layers": list(self.args.layers), "head": self.args.head, "networks": self.args.networks}
 
     def state_dict(self) -> dict[str, Any]:
         """See :class:`OffPolicyTrainer`."""
