@@ -8,6 +8,8 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
 from rl2grid.drawing.grid_drawing import (
+    NO_CAPTION,
+    Caption,
     FrameRenderer,
     GridDrawing,
     geometry_of,
@@ -138,3 +140,11 @@ def test_a_grid_without_layout_is_refused():
     nowhere = dataclasses.replace(BUS14, layout=((0.0, 0.0),) * BUS14.n_sub)
     with pytest.raises(UsageError, match="bus14 cannot be drawn"):
         FrameRenderer(nowhere)
+
+
+def test_a_caption_leaves_nothing_of_the_one_before():
+    renderer, scene = FrameRenderer(BUS14, size=(640, 360)), reference_scene(BUS14)
+    captions = (Caption("a", "one"), Caption("b", "one"), Caption("b", "another"), NO_CAPTION, Caption("a", "one"))
+    for caption in captions:
+        expected = FrameRenderer(BUS14, size=(640, 360)).frame(scene, caption)
+        np.testing.assert_array_equal(renderer.frame(scene, caption), expected)

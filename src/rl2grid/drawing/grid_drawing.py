@@ -264,27 +264,38 @@ class GridDrawing:
         for order, artist in enumerate(self.artists):
             artist.set_zorder(2 + 0.01 * order)
             axes.add_artist(artist)
+        self._topo_vect: Ints | None = None
+        self._route(np.ones(grid.dim_topo, np.int32))
 
     def show(self, scene: Scene) -> None:
         """Show ``scene``."""
+        # From one picture of an episode to the next the topology seldom changes.
+        if not np.array_equal(scene.topo_vect, self._topo_vect):
+            self._route(scene.topo_vect)
+        self._show_lines(scene)
+        self._show_highlights(scene)
+        self._show_symbols(scene)
+
+    def _route(self, topo_vect: Ints) -> None:
+        """Lead every element to its busbar."""
         geometry, grid = self._geometry, self._grid
-        split = self._split(scene.topo_vect)
-        end, approach = self._ends(scene.topo_vect, split)
-        courses = self._courses(end, approach)
-        on = (scene.topo_vect[grid.line_or_pos_topo_vect] > 0) & (scene.topo_vect[grid.line_ex_pos_topo_vect] > 0)
-        self._show_lines(scene, courses, on)
+        self._topo_vect = topo_vect.copy()
+        split = self._split(topo_vect)
+        end, approach = self._ends(topo_vect, split)
+        self._courses = self._courses_between(end, approach)
+        self._on = (topo_vect[grid.line_or_pos_topo_vect] > 0) & (topo_vect[grid.line_ex_pos_topo_vect] > 0)
+        self._lines.set_segments(list(self._courses[self._on]))
+        self._out.set_segments(list(self._courses[~self._on]))
         stubs = np.stack((end, approach), axis=1)[geometry.symbol_element]
-        stubs = np.concatenate((stubs, geometry.symbol[:, None]), axis=1)
-        self._stubs.set_segments(list(stubs))
-        self._show_highlights(scene, courses, stubs)
+        self._stub_courses = np.concatenate((stubs, geometry.symbol[:, None]), axis=1)
+        self._stubs.set_segments(list(self._stub_courses))
         bars = geometry.centre[split][:, None, None] + self.unit * np.array(
             [[[-_BAR, _GAP], [_BAR, _GAP]], [[-_BAR, -_GAP], [_BAR, -_GAP]]]
         )
         self._bars.set_segments(list(bars.reshape(-1, 2, 2)))
-        touching = split[grid.element_to_subid] & (scene.topo_vect > 0)
+        touching = split[grid.element_to_subid] & (topo_vect > 0)
         self._contacts.set_verts(list(_circles(end[touching], 0.055 * self.unit)))
         self._discs.set_verts(list(_circles(geometry.centre[~split], _DISC * self.unit)))
-        self._show_symbols(scene)
 
     def beside(self, element: int, distance: float) -> tuple[float, float]:
         """The point at ``distance`` units from a substation, towards one of its elements (entry of ``topo_vect``)."""
@@ -320,19 +331,18 @@ class GridDrawing:
         around = np.where((split[sub] & behind)[:, None], around, end)
         return centre + end, centre + around
 
-    def _courses(self, end: Points, approach: Points) -> Points:
+    def _courses_between(self, end: Points, approach: Points) -> Points:
         """[line, 6, 2] from origin to extremity."""
         grid, middle = self._grid, self._geometry.line_middle
         origin, extremity = grid.line_or_pos_topo_vect, grid.line_ex_pos_topo_vect
         points = (end[origin], approach[origin], middle[:, 0], middle[:, 1], approach[extremity], end[extremity])
         return np.stack(points, axis=1)
 
-    def _show_lines(self, scene: Scene, courses: Points, on: Flags) -> None:
-        theme = self._theme
+    def _show_lines(self, scene: Scene) -> None:
+        theme, on = self._theme, self._on
         rho = np.where(np.isnan(scene.rho), 0.0, scene.rho)[on]
         colours = self._colours(Normalize(0, FULL_SCALE)(rho))
         colours[np.isnan(scene.rho)[on]] = to_rgba(theme.muted)
-        self._lines.set_segments(list(courses[on]))
         self._lines.set_color(colours)
         self._lines.set_linewidth(list(self._width * (0.9 + 0.9 * np.clip(rho, 0, 1))))
         out = np.tile(to_rgba(theme.out), (len(on), 1))
@@ -340,11 +350,10 @@ class GridDrawing:
         out[scene.attacked] = to_rgba(PURPLE)
         # A pale line would not be seen on the marker.
         out[scene.highlighted[self._grid.line_or_pos_topo_vect]] = to_rgba(theme.text)
-        self._out.set_segments(list(courses[~on]))
         self._out.set_color(out[~on])
 
-    def _show_highlights(self, scene: Scene, courses: Points, stubs: Points) -> None:
-        grid, chosen = self._grid, scene.highlighted
+    def _show_highlights(self, scene: Scene) -> None:
+        grid, chosen, courses, stubs = self._grid, scene.highlighted, self._courses, self._stub_courses
         middle = courses[:, 2:4].mean(axis=1, keepdims=True)
         at_origin = np.concatenate((courses[:, :3], middle), axis=1)[chosen[grid.line_or_pos_topo_vect]]
         at_extremity = np.concatenate((courses[:, :2:-1], middle), axis=1)[chosen[grid.line_ex_pos_topo_vect]]
@@ -417,17 +426,27 @@ class FrameRenderer:
             for artist in self._drawing.artists:
                 artist.set_animated(True)
             self._canvas.draw()
-        self._background = self._canvas.copy_from_bbox(figure.bbox)
+        self._legend_only = self._canvas.copy_from_bbox(figure.bbox)
+        self._background = self._legend_only
 
     def frame(self, scene: Scene, caption: Caption = NO_CAPTION) -> NDArray[np.uint8]:
         """A picture of ``scene``, uint8 [height, width, 3]."""
         self._drawing.show(scene)
         self._headline.set_text(caption.headline)
-        self._sentence.set_text(textwrap.shorten(caption.sentence, _SENTENCE_LENGTH, placeholder=" …"))
+        self._say(textwrap.shorten(caption.sentence, _SENTENCE_LENGTH, placeholder=" …"))
         self._canvas.restore_region(self._background)
-        for artist in (*self._drawing.artists, self._headline, self._sentence):
+        for artist in (*self._drawing.artists, self._headline):
             self._axes.draw_artist(artist)
         return np.array(self._canvas.buffer_rgba())[..., :3]
+
+    def _say(self, sentence: str) -> None:
+        """Put a sentence into the background: letters are slow to draw, and it stays for many pictures."""
+        if sentence == self._sentence.get_text():
+            return
+        self._sentence.set_text(sentence)
+        self._canvas.restore_region(self._legend_only)
+        self._axes.draw_artist(self._sentence)
+        self._background = self._canvas.copy_from_bbox(self._canvas.figure.bbox)
 
 
 def add_legend(figure: Figure, grid: Grid, theme: Theme, *, known_loading: bool) -> None:
