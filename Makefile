@@ -5,20 +5,23 @@ BIN := $(VENV)/bin
 # Grid2Op's redispatch solver slows down sixfold on contended BLAS threads.
 export OPENBLAS_NUM_THREADS := 1
 WORKERS ?= 2
+# The theme announces its successor at every build.
+export NO_MKDOCS_2_WARNING := 1
 
-.PHONY: help demo test test-slow lint clean
+.PHONY: help demo docs test test-slow lint clean
 
 help:
 	@echo "make demo       train PPO on bus14, evaluate it, write reports/demo (a few minutes)"
 	@echo "make test       linters, types, layers and the tests (under 12 minutes)"
-	@echo "make test-slow  the longer tests too"
+	@echo "make test-slow  the longer tests too, the code blocks of the documentation among them"
+	@echo "make docs       build the documentation into site/ (half a minute), to be opened as site/index.html"
 	@echo "make clean      remove the virtual environment and what was made"
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	@echo "== Creating the virtual environment $(VENV) and installing rl2grid (one to three minutes)"
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "rl2grid needs Python 3.11 or newer: set PYTHON=/path/to/python3.11."; exit 1; }
 	@$(PYTHON) -m venv $(VENV)
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --progress-bar on --constraint constraints.txt --editable ".[train,analysis,dev]"
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --progress-bar on --constraint constraints.txt --editable ".[train,analysis,docs,dev]"
 	@touch $@
 
 # RLlib and TorchRL are large: only the longer tests need them.
@@ -29,6 +32,10 @@ $(VENV)/.installed-examples: $(VENV)/.installed
 
 demo: $(VENV)/.installed
 	@$(BIN)/rl2grid demo
+
+docs: $(VENV)/.installed
+	@$(BIN)/python -m mkdocs build --strict --quiet
+	@echo "Written: site/index.html"
 
 lint: $(VENV)/.installed
 	@echo "== Style, types and layers"
@@ -44,4 +51,4 @@ test-slow: $(VENV)/.installed-examples
 	@$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
 clean:
-	rm -rf $(VENV) reports runs .pytest_cache .mypy_cache .ruff_cache .import_linter_cache
+	rm -rf $(VENV) reports runs site .pytest_cache .mypy_cache .ruff_cache .import_linter_cache
