@@ -1,8 +1,8 @@
 """How fast an episode is drawn, as ``rl2grid watch`` draws it for an animation.
 
-``python benchmarks/watch.py [GRID] [--frames N]`` records steps of a validation month of bus118-MOB-v0 (doing nothing), draws
-1,000 pictures of 1280 by 720 pixels, and writes ``benchmarks/results/watch.json``: seconds on the clock, seconds of
-processor time (what the drawing itself takes, however busy the machine is), and the load of the machine before it.
+``python benchmarks/watch.py [GRID] [--frames N]`` records steps of a validation month of bus118-MOB-v0 (doing nothing),
+draws 1,000 pictures of 1280 by 720 pixels, and writes ``benchmarks/results/watch.json``: seconds on the clock, seconds
+of processor time (what the drawing itself takes, however busy the machine is), and the load of the machine before it.
 """
 
 from __future__ import annotations

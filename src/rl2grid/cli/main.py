@@ -48,6 +48,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(command_line: list[str]) -> int:
+    if command_line[:1] == ["train"]:
+        return train(command_line[1:])
+    parser = make_parser()
+    options = parser.parse_args(command_line)
+    if options.command is None:
+        parser.print_help()
+        return 0
+    status: int = options.run(options)
+    return status
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The parser of all subcommands but ``train``, which parses its own flags."""
     parser = _Parser(prog="rl2grid", description="A benchmark for reinforcement learning in power-grid operation.")
     parser.add_argument("--version", action="version", version=f"rl2grid {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="command", parser_class=_Parser)
@@ -61,14 +74,7 @@ def _run(command_line: list[str]) -> int:
     data.add_parser(commands)
     watch.add_parser(commands)
     study.add_parser(commands)
-    if command_line[:1] == ["train"]:
-        return train(command_line[1:])
-    options = parser.parse_args(command_line)
-    if options.command is None:
-        parser.print_help()
-        return 0
-    status: int = options.run(options)
-    return status
+    return parser
 
 
 def _add_demo(commands: argparse._SubParsersAction[_Parser]) -> None:

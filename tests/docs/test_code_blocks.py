@@ -1,0 +1,80 @@
+"""What the documentation shows works: Python blocks run, commands exist with the flags that are shown.
+
+The Python blocks of a page run one after the other, in one namespace and an empty folder. A block that cannot run
+says so with ``<!-- not run: reason -->`` before it.
+"""
+
+import shlex
+from types import SimpleNamespace
+
+import pytest
+from documentation import PAGES, blocks, name_of
+
+from rl2grid.cli import main as command_line
+from rl2grid.cli import train
+from rl2grid.envs.tasks import find_task
+from rl2grid.experiments import runs
+from rl2grid.experiments.agents import AGENTS
+
+QUICK = (["tasks"], ["actions"], ["study", "list"], ["data", "list"])
+"""Subcommands that are run as shown."""
+SHOWN = [
+    (block, line)
+    for page in PAGES
+    for block in blocks(page)
+    if block.language in ("", "sh")
+    for line in block.code.replace("\\\n", " ").splitlines()
+    if line.startswith("rl2grid ")
+]
+PYTHON_PAGES = [page for page in PAGES if any(block.language == "python" for block in blocks(page))]
+
+
+def arguments_of(line):
+    return shlex.split(line, comments=True)[1:]
+
+
+def identify(value):
+    return value if isinstance(value, str) else f"{name_of(value.page)}:{value.line}"
+
+
+@pytest.mark.parametrize(("block", "line"), SHOWN, ids=identify)
+def test_commands_exist_with_their_flags(block, line, monkeypatch):
+    assert block.language == "sh", "a block of commands is to be marked as ```sh"
+    arguments = arguments_of(line)
+    if arguments[0] == "train":
+        began = []
+        monkeypatch.setattr(runs, "train", lambda args, **_: began.append(args))
+        monkeypatch.setattr(runs, "resume", lambda folder, **_: began.append(folder))
+        monkeypatch.setattr(runs, "read_config", lambda folder: (SimpleNamespace(task="bus14-T0"), {}))
+        monkeypatch.setattr(train, "_report", lambda *_: 0)
+        monkeypatch.setattr(train, "_validator", lambda _: None)
+        assert command_line.main(arguments) == 0
+        assert began
+        return
+    options = command_line.make_parser().parse_args(arguments)
+    if hasattr(options, "task"):
+        find_task(options.task)
+    if hasattr(options, "agent"):
+        assert options.agent in AGENTS or options.agent.startswith("runs/")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "line", sorted({line for _, line in SHOWN if any(arguments_of(line)[: len(quick)] == quick for quick in QUICK)})
+)
+def test_quick_commands_run(line, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert command_line.main(arguments_of(line)) == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", PYTHON_PAGES, ids=name_of)
+def test_python_blocks_run(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    namespace = {"__name__": "documentation"}
+    for block in blocks(page):
+        if block.language != "python" or block.not_run:
+            continue
+        # The number of the line of the page, in tracebacks.
+        code = compile("\n" * (block.line - 1) + block.code, str(page), "exec")
+        exec(code, namespace)

@@ -1,0 +1,25 @@
+"""Every relative link of the readme and the documentation leads somewhere, anchors included."""
+
+import pytest
+from documentation import PAGES, ROOT, anchors, links, name_of
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_links_lead_somewhere(page):
+    broken = []
+    for link in links(page):
+        path, _, anchor = link.partition("#")
+        if path.startswith(("https://", "http://")):
+            continue
+        target = (page.parent / path).resolve() if path else page
+        if not target.exists() or not target.is_relative_to(ROOT):
+            broken.append(link)
+        elif anchor and target.suffix == ".md" and anchor not in anchors(target):
+            broken.append(link)
+    assert not broken
+
+
+def test_every_page_is_reached_by_the_menu():
+    menu = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    missing = [name_of(page) for page in PAGES[1:] if page.relative_to(ROOT / "docs").as_posix() not in menu]
+    assert not missing

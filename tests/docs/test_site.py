@@ -1,0 +1,48 @@
+"""The documentation site builds without a warning, and needs no network when it is read."""
+
+import re
+
+import pytest
+
+pytest.importorskip("mkdocs")
+
+from documentation import ROOT
+from mkdocs.commands.build import build
+from mkdocs.config import load_config
+
+FETCHED = re.compile(r"""<(?:script|link|img)\b[^>]*?(?:src|href)=["']?(https?:[^"'\s>]+)""")
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """A folder with the site, built strictly: a broken link or anchor is an error."""
+    folder = tmp_path_factory.mktemp("site")
+    config = load_config(str(ROOT / "mkdocs.yml"), site_dir=str(folder), strict=True)
+    config.plugins.on_startup(command="build", dirty=False)
+    try:
+        build(config)
+    finally:
+        config.plugins.on_shutdown()
+    return folder
+
+
+def test_no_page_fetches_anything(site):
+    fetched = {page.name: FETCHED.findall(page.read_text(encoding="utf-8")) for page in site.rglob("*.html")}
+    assert {name: addresses for name, addresses in fetched.items() if addresses} == {}
+
+
+def test_formulas_are_mathml(site):
+    page = (site / "mdp.html").read_text(encoding="utf-8")
+    assert page.count("<math") > 50
+    assert "arithmatex" not in page
+
+
+def test_grids_have_pictures_and_the_reference_their_docstrings(site):
+    tasks = (site / "tasks.html").read_text(encoding="utf-8")
+    pictures = re.findall(r'src="(assets/grids/[^"#]+)', tasks)
+    assert len(pictures) == 14
+    assert all((site / picture).read_bytes().startswith(b"\x89PNG") for picture in pictures)
+    assert "<!-- tasks:" not in tasks
+    rewards = (site / "reference/rl2grid/mdp/rewards.html").read_text(encoding="utf-8")
+    assert "staying alive is never punished" in rewards
+    assert 'href="state.html#rl2grid.mdp.state.GridState"' in rewards
