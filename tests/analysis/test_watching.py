@@ -95,6 +95,16 @@ def test_the_page_is_whole_and_needs_nothing_else(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["a.html"]
 
 
+def test_the_legend_has_the_colours_of_the_lines_in_light_and_dark(tmp_path):
+    recording = made_up(BUS14, 3)
+    write_watch_page(tmp_path / "page.html", BUS14, recording)
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    colours = page_data(BUS14, recording)["colours"]
+    for percent in (10, 50, 95, 120):
+        style = f"--light:{colours['light'][percent]};--dark:{colours['dark'][percent]}"
+        assert f"style='{style}' /></svg> {percent}% loaded" in page
+
+
 def test_a_month_of_the_largest_grid_stays_small(tmp_path):
     grid = load_grid("bus118-MOB-v0")
     write_watch_page(tmp_path / "a.html", grid, made_up(grid, 8064, game_over=""))

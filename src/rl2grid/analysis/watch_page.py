@@ -133,10 +133,10 @@ def _legend(grid: Grid) -> str:
     }
     if not grid.n_storage:
         del shapes["storage"]
-    colours = loading_colours(LIGHT)
     for rho in (0.1, 0.5, 0.95, 1.2):
-        colour = to_hex(colours(rho / FULL_SCALE))
-        shapes[f"{rho:.0%} loaded"] = f"<path class=line d='M0 6h28' style='stroke:{colour}' />"
+        light, dark = (to_hex(loading_colours(theme)(rho / FULL_SCALE)) for theme in (LIGHT, DARK))
+        style = f"--light:{light};--dark:{dark}"
+        shapes[f"{rho:.0%} loaded"] = f"<path class='line loaded' d='M0 6h28' style='{style}' />"
     for name in ("attacked", "maintenance", "out"):
         shapes[name] = f"<path class='line off {name}' d='M0 6h28' />"
     entries = [f"<span><svg viewBox='0 0 28 12'>{shape}</svg> {name}</span>" for name, shape in shapes.items()]
