@@ -14,6 +14,9 @@ _FENCE = re.compile(r"^(?P<fence>`{3,})(?P<language>\w*)[^\n]*\n(?P<code>.*?)^(?
 _NOT_RUN = re.compile(r"<!-- not run: (?P<reason>[^>]+) -->\s*$")
 _INLINE_CODE = re.compile(r"`[^`\n]+`")
 _LINK = re.compile(r"\[(?:[^\[\]]|\[[^\]]*\])*\]\((?P<target>[^)\s]+)\)")
+_FILE = re.compile(
+    r"`(?P<path>(?:tests|benchmarks|examples|docs|src|rl2grid|\w+)/[\w./-]+\.(?:py|json|toml|npz))(?:::\w+)?`"
+)
 _HEADING = re.compile(r"^#{1,6} +(?P<text>.+?) *$", re.MULTILINE)
 
 
@@ -48,6 +51,12 @@ def links(page: Path) -> Iterator[str]:
     """What a page links to: paths and addresses, as written."""
     for link in _LINK.finditer(_INLINE_CODE.sub("`code`", _prose(page))):
         yield link["target"]
+
+
+def files_named(page: Path) -> Iterator[str]:
+    """Files of the repository that a page names in code, as written."""
+    for name in _FILE.finditer(_prose(page)):
+        yield name["path"]
 
 
 def anchors(page: Path) -> set[str]:

@@ -1,7 +1,7 @@
 """Every relative link of the readme and the documentation leads somewhere, anchors included."""
 
 import pytest
-from documentation import PAGES, ROOT, anchors, links, name_of
+from documentation import PAGES, ROOT, anchors, files_named, links, name_of
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
@@ -19,6 +19,14 @@ def test_links_lead_somewhere(page):
         ):
             broken.append(link)
     assert not broken
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_files_that_are_named_exist(page):
+    # Pages name files from the root, from the package, or from the tests.
+    roots = (ROOT, ROOT / "src", ROOT / "src" / "rl2grid", ROOT / "tests", ROOT / "docs", page.parent)
+    missing = [name for name in files_named(page) if not any((root / name).exists() for root in roots)]
+    assert not missing
 
 
 def test_every_page_is_reached_by_the_menu():
