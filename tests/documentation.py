@@ -14,9 +14,7 @@ _FENCE = re.compile(r"^(?P<fence>`{3,})(?P<language>\w*)[^\n]*\n(?P<code>.*?)^(?
 _NOT_RUN = re.compile(r"<!-- not run: (?P<reason>[^>]+) -->\s*$")
 _INLINE_CODE = re.compile(r"`[^`\n]+`")
 _LINK = re.compile(r"\[(?:[^\[\]]|\[[^\]]*\])*\]\((?P<target>[^)\s]+)\)")
-_FILE = re.compile(
-    r"`(?P<path>(?:tests|benchmarks|examples|docs|src|rl2grid|\w+)/[\w./-]+\.(?:py|json|toml|npz))(?:::\w+)?`"
-)
+_FILE = re.compile(r"`(?P<path>\w+/[\w./-]+\.(?:py|json|toml|npz))(?:::\w+)?`")
 _HEADING = re.compile(r"^#{1,6} +(?P<text>.+?) *$", re.MULTILINE)
 
 

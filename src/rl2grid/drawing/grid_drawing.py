@@ -264,7 +264,6 @@ class GridDrawing:
         for order, artist in enumerate(self.artists):
             artist.set_zorder(2 + 0.01 * order)
             axes.add_artist(artist)
-        self._topo_vect: Ints | None = None
         self._route(np.ones(grid.dim_topo, np.int32))
 
     def show(self, scene: Scene) -> None:
