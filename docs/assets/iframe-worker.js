@@ -1,2 +1,46 @@
-/* iframe-worker 1.0.4, Copyright (c) 2020-2022 Martin Donath, MIT licence: lets the search run where pages are read from a folder */
-"use strict";(()=>{function c(s,n){parent.postMessage(s,n||"*")}function d(...s){return s.reduce((n,e)=>n.then(()=>new Promise(r=>{let t=document.createElement("script");t.src=e,t.onload=r,document.body.appendChild(t)})),Promise.resolve())}var o=class extends EventTarget{constructor(e){super();this.url=e;this.m=e=>{e.source===this.w&&(this.dispatchEvent(new MessageEvent("message",{data:e.data})),this.onmessage&&this.onmessage(e))};this.e=(e,r,t,i,m)=>{if(r===`${this.url}`){let a=new ErrorEvent("error",{message:e,filename:r,lineno:t,colno:i,error:m});this.dispatchEvent(a),this.onerror&&this.onerror(a)}};let r=document.createElement("iframe");r.hidden=!0,document.body.appendChild(this.iframe=r),this.w.document.open(),this.w.document.write(`<html><body><script>postMessage=${c};importScripts=${d};addEventListener("error",({error})=>{parent.dispatchEvent(new ErrorEvent("error",{filename:"${e}",error}))})<\/script><script src=${e}?${+Date.now()}><\/script></body></html>`),this.w.document.close(),onmessage=this.m,onerror=this.e,this.r=new Promise((t,i)=>{this.w.onload=t,this.w.onerror=i})}terminate(){this.iframe.remove(),onmessage=onerror=null}postMessage(e){this.r.catch().then(()=>{this.w.dispatchEvent(new MessageEvent("message",structuredClone({data:e})))})}get w(){return this.iframe.contentWindow}};window.IFrameWorker=o;location.protocol==="file:"&&(window.Worker=o);})();
+// Browsers refuse workers to pages that are read from a folder. There, the script of the search runs in a hidden
+// frame instead, behind the interface of a worker. (The theme loads one of its own unless there is a file of this name.)
+
+class FrameWorker extends EventTarget {
+  constructor(address) {
+    super();
+    this.frame = document.createElement("iframe");
+    this.frame.hidden = true;
+    document.body.append(this.frame);
+    const inside = this.frame.contentWindow;
+    inside.postMessage = (data) => this.receive(data);
+    inside.importScripts = (...addresses) =>
+      addresses.reduce((before, next) => before.then(() => this.load(next)), Promise.resolve());
+    this.ready = this.load(address);
+  }
+
+  load(address) {
+    return new Promise((resolve, reject) => {
+      const script = this.frame.contentDocument.createElement("script");
+      script.src = new URL(address, location.href).href;
+      script.onload = resolve;
+      script.onerror = reject;
+      this.frame.contentDocument.body.append(script);
+    });
+  }
+
+  receive(data) {
+    const event = new MessageEvent("message", { data });
+    this.dispatchEvent(event);
+    if (this.onmessage) this.onmessage(event);
+  }
+
+  postMessage(data) {
+    this.ready.then(() => {
+      const inside = this.frame.contentWindow;
+      const event = new inside.MessageEvent("message", { data });
+      inside.dispatchEvent(event);
+    });
+  }
+
+  terminate() {
+    this.frame.remove();
+  }
+}
+
+if (location.protocol === "file:") window.Worker = FrameWorker;
