@@ -9,10 +9,7 @@
 
 from __future__ import annotations
 
-import base64
 import html
-import json
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,8 +17,20 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from rl2grid.analysis import figures, tables
+from rl2grid.analysis.page import (
+    cell_html,
+    code_html,
+    commands_html,
+    facts_html,
+    figure_html,
+    identities_html,
+    scrolling,
+    table_html,
+    write_page,
+    write_text,
+)
 from rl2grid.analysis.recordings import Recording
-from rl2grid.analysis.results import EvaluationResult, check_comparable, identity_hash
+from rl2grid.analysis.results import EvaluationResult, check_comparable
 from rl2grid.analysis.summary import Summary
 from rl2grid.analysis.training import TrainingCurve
 from rl2grid.drawing.theme import DARK, LIGHT, Theme
@@ -74,47 +83,18 @@ def write_report(
         light = picture.draw(LIGHT)
         figures.save_figure(light, folder / FIGURES_FOLDER / picture.name)
         dark = figures.png_bytes(picture.draw(DARK))
-        drawn.append(figure_html(picture.caption, figures.png_bytes(light), dark, picture.command))
-    _write(folder / TABLE_FILE, f"# {title}\n\n{tables.markdown_table(summaries)}\n{tables.LEGEND}\n")
+        drawn.append(figure_html(picture.caption, figures.png_bytes(light), dark, code_html(picture.command)))
+    write_text(folder / TABLE_FILE, f"# {title}\n\n{tables.markdown_table(summaries)}\n{tables.LEGEND}\n")
     body = [
         _header(title, introduction, summaries),
         f"<section><h2>Results</h2>{_table_html(summaries)}<p class=note>{html.escape(tables.LEGEND)}</p></section>",
         *drawn,
         _endings_html(summaries),
         _commands_html(results, commands),
-        _identity_html(results),
+        identities_html([(result.summary.agent, result.identity) for result in results]),
     ]
     write_page(folder / REPORT_FILE, title, body)
     return folder / REPORT_FILE
-
-
-def write_page(path: Path, title: str, parts: Sequence[str]) -> None:
-    """Write one HTML page that needs no other file, in the place of an earlier one; ``parts`` are HTML."""
-    page = _PAGE.replace("{title}", html.escape(title)).replace("{body}", "\n".join(parts))
-    _write(path, page)
-
-
-def facts_html(facts: Sequence[tuple[str, str]]) -> str:
-    """Names and values as cards."""
-    cards = "".join(f"<div><dt>{html.escape(name)}</dt><dd>{html.escape(value)}</dd></div>" for name, value in facts)
-    return f"<dl class=facts>{cards}</dl>"
-
-
-def table_html(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table that scrolls sideways on narrow screens; the first two columns are words."""
-    head = "".join(f"<th>{html.escape(heading)}</th>" for heading in headings)
-    body = "".join(f"<tr>{''.join(f'<td>{html.escape(cell)}</td>' for cell in row)}</tr>" for row in rows)
-    return _scrolling(head, body)
-
-
-def figure_html(caption: str, light: bytes, dark: bytes, command: str = "") -> str:
-    """A figure, PNG in both themes, and below it what is to be seen and what made it."""
-    made = f"<code>{html.escape(command)}</code>" if command else ""
-    return (
-        f"<section><figure><picture><source media='(prefers-color-scheme: dark)' srcset='{_data_uri(dark)}'>"
-        f"<img src='{_data_uri(light)}' alt='{html.escape(caption, quote=True)}'></picture>"
-        f"<figcaption>{html.escape(caption)}{made}</figcaption></figure></section>"
-    )
 
 
 def _pictures(
@@ -170,19 +150,9 @@ def _table_html(summaries: Sequence[Summary]) -> str:
     head = "".join(f"<th>{html.escape(heading)}</th>" for heading in tables.HEADINGS)
     rows = []
     for summary in summaries:
-        cells = "".join(f"<td>{_cell(cell)}</td>" for cell in tables.table_cells(summary))
+        cells = "".join(f"<td>{cell_html(cell)}</td>" for cell in tables.table_cells(summary))
         rows.append(f"<tr{' class=best' if tables.is_best(summary, summaries) else ''}>{cells}</tr>")
-    return _scrolling(head, "".join(rows))
-
-
-def _scrolling(head: str, body: str) -> str:
-    return f"<div class=scroll><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
-
-
-def _cell(text: str) -> str:
-    """A cell; an interval goes below its value, in small print."""
-    value, bracket, interval = html.escape(text).partition(" [")
-    return f"{value}<small>[{interval}</small>" if bracket else value
+    return scrolling(head, "".join(rows))
 
 
 def _endings_html(summaries: Sequence[Summary]) -> str:
@@ -203,86 +173,6 @@ def _endings_html(summaries: Sequence[Summary]) -> str:
 
 
 def _commands_html(results: Sequence[EvaluationResult], commands: Mapping[str, str]) -> str:
-    made = [(f"results of {result.summary.agent}", result.command) for result in results]
-    made += [(purpose, command) for purpose, command in commands.items()]
-    items = "".join(
-        f"<dt>{html.escape(name)}</dt><dd><code>{html.escape(command)}</code></dd>" for name, command in made
-    )
-    return f"<section><h2>What made every number</h2><dl class=commands>{items}</dl></section>"
-
-
-def _identity_html(results: Sequence[EvaluationResult]) -> str:
-    parts = []
-    for result in results:
-        words = json.dumps(dict(result.identity), indent=2, default=str)
-        parts.append(
-            f"<details><summary>{html.escape(result.summary.agent)} "
-            f"<code>{identity_hash(result.identity)}</code></summary><pre>{html.escape(words)}</pre></details>"
-        )
-    return (
-        "<section><h2>Identity</h2><p class=note>Results are comparable when everything but the agent is the same: "
-        f"task, scenarios, actions, engine and versions.</p>{''.join(parts)}</section>"
-    )
-
-
-def _data_uri(png: bytes) -> str:
-    return f"data:image/png;base64,{base64.b64encode(png).decode()}"
-
-
-def _write(path: Path, text: str) -> None:
-    temporary = path.with_name(f"{path.name}.tmp")
-    temporary.write_text(text, encoding="utf-8", newline="\n")
-    os.replace(temporary, path)
-
-
-_PAGE = """<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="color-scheme" content="light dark">
-<title>{title}</title>
-<style>
-:root { --paper: #fff; --ink: #1b1f24; --muted: #5c666f; --rule: #e4e7ea; --card: #f6f8fa; --accent: #0072b2; }
-@media (prefers-color-scheme: dark) {
-  :root { --paper: #15181c; --ink: #e8eaed; --muted: #9aa3ad; --rule: #30363d; --card: #1c2127; --accent: #56b4e9; }
-}
-* { box-sizing: border-box; }
-body { margin: 0 auto; padding: 1.5rem 1rem 4rem; max-width: 60rem; background: var(--paper); color: var(--ink);
-  font: 16px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, sans-serif; -webkit-text-size-adjust: 100%; }
-h1 { font-size: 1.7rem; line-height: 1.2; margin: .5rem 0; }
-h2 { font-size: 1.15rem; margin: 2.5rem 0 .75rem; }
-.note, figcaption { color: var(--muted); font-size: .85rem; }
-.facts { display: grid; grid-template-columns: repeat(4, 1fr); gap: .75rem; margin: 1.25rem 0 0; }
-@media (max-width: 40rem) { .facts { grid-template-columns: repeat(2, 1fr); } }
-.facts div { background: var(--card); border-radius: .5rem; padding: .6rem .8rem; }
-.facts dt { color: var(--muted); font-size: .8rem; }
-.facts dd { margin: 0; font-size: 1.1rem; font-weight: 600; overflow-wrap: anywhere; }
-.scroll { overflow-x: auto; -webkit-overflow-scrolling: touch; }
-table { border-collapse: collapse; width: 100%; font-size: .85rem; font-variant-numeric: tabular-nums; }
-th, td { padding: .45rem .6rem; text-align: right; white-space: nowrap; border-bottom: 1px solid var(--rule);
-  vertical-align: top; }
-th { color: var(--muted); font-weight: 500; }
-th:nth-child(-n+2), td:nth-child(-n+2) { text-align: left; }
-td:first-child, th:first-child { position: sticky; left: 0; background: var(--paper); }
-td small { display: block; color: var(--muted); font-size: .75rem; font-weight: 400; }
-tr.best td { font-weight: 650; }
-tr.best td:first-child { box-shadow: inset 3px 0 var(--accent); }
-figure { margin: 2.5rem 0 0; }
-img { display: block; width: 100%; height: auto; border: 1px solid var(--rule); border-radius: .5rem; }
-figcaption { margin-top: .5rem; }
-figcaption code { display: block; margin-top: .25rem; }
-code, pre { font: .8rem/1.5 ui-monospace, SFMono-Regular, Menlo, Consolas, monospace; overflow-wrap: anywhere; }
-dl.commands dt { color: var(--muted); font-size: .85rem; }
-dl.commands dd { margin: .15rem 0 .9rem; padding: .5rem .7rem; background: var(--card); border-radius: .4rem; }
-details { border-bottom: 1px solid var(--rule); padding: .5rem 0; }
-summary { cursor: pointer; }
-pre { overflow-x: auto; background: var(--card); border-radius: .4rem; padding: .75rem; }
-@media print { body { max-width: none; } figure, table { break-inside: avoid; } }
-</style>
-</head>
-<body>
-{body}
-</body>
-</html>
-"""
+    made = [(f"results of {html.escape(result.summary.agent)}", result.command) for result in results]
+    made += [(html.escape(purpose), command) for purpose, command in commands.items()]
+    return f"<section><h2>What made every number</h2>{commands_html(made)}</section>"

@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.table import Table
 
-from rl2grid.analysis import report
+from rl2grid.analysis import page
 from rl2grid.analysis.figures import png_bytes
 from rl2grid.drawing.theme import DARK, LIGHT, Theme, style
 from rl2grid.errors import UsageError
@@ -219,7 +219,7 @@ def write_page(comparison: Comparison, path: Path) -> None:
     parts = [_header(comparison), _table(comparison), *(_figure(comparison, *each) for each in pictures)]
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        report.write_page(path, _title(comparison), parts)
+        page.write_page(path, _title(comparison), parts)
     except OSError as error:
         raise UsageError(f"Page {path} cannot be written ({error}): choose another place.") from error
 
@@ -290,13 +290,13 @@ def _header(comparison: Comparison) -> str:
         f"<header><h1>{html.escape(_title(comparison))}</h1>"
         "<p>The months of the year that the bundled series are of, beside the same months of generated years. Losses, "
         "slack and loading come from the AC power flow of every hour, in the reference topology.</p>"
-        f"{report.facts_html(facts)}<p class=note>{html.escape(listed)}</p></header>"
+        f"{page.facts_html(facts)}<p class=note>{html.escape(listed)}</p></header>"
     )
 
 
 def _table(comparison: Comparison) -> str:
     return (
-        f"<section><h2>In numbers</h2>{report.table_html(HEADINGS, table_rows(comparison))}"
+        f"<section><h2>In numbers</h2>{page.table_html(HEADINGS, table_rows(comparison))}"
         "<p class=note>After 1 h: correlation of a value with the one an hour later. Distance: largest "
         "difference of the two cumulative distributions, from 0 (the same) to 1.</p></section>"
     )
@@ -304,7 +304,7 @@ def _table(comparison: Comparison) -> str:
 
 def _figure(comparison: Comparison, caption: str, draw: Callable[[Comparison, Theme], Figure]) -> str:
     light, dark = (_png(comparison, draw, theme) for theme in (LIGHT, DARK))
-    return report.figure_html(caption, light, dark)
+    return page.figure_html(caption, light, dark)
 
 
 def _png(comparison: Comparison, draw: Callable[[Comparison, Theme], Figure], theme: Theme) -> bytes:

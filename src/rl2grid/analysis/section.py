@@ -9,7 +9,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +19,7 @@ from rl2grid.analysis import comparison_figures as compare
 from rl2grid.analysis import figures
 from rl2grid.analysis.ending_figures import draw_ending_bars, draw_ending_map
 from rl2grid.analysis.methods import Method, group_methods
+from rl2grid.analysis.page import write_text
 from rl2grid.analysis.result_tables import Methods, result_tables
 from rl2grid.analysis.results import EvaluationResult
 from rl2grid.analysis.tables import WRITERS, ResultTable
@@ -97,12 +97,12 @@ def results_section(
     for table in section.tables:
         on_file(table.name)
         for suffix, writer in WRITERS.items():
-            _write(folder / TABLES_FOLDER / f"{table.name}.{suffix}", writer(table))
+            write_text(folder / TABLES_FOLDER / f"{table.name}.{suffix}", writer(table))
     for picture in section.pictures:
         on_file(picture.name)
         figures.save_figure(picture.draw(theme), folder / FIGURES_FOLDER / picture.name)
     # Last: where there is an index, everything it lists is there.
-    _write(folder / INDEX_FILE, _index(section, results, runs, command))
+    write_text(folder / INDEX_FILE, _index(section, results, runs, command))
     return folder / INDEX_FILE
 
 
@@ -205,9 +205,3 @@ def _index(section: Section, results: Sequence[EvaluationResult], runs: Sequence
 
 def _short(task: str) -> str:
     return task.removeprefix("rl2grid/").removesuffix("-v0")
-
-
-def _write(path: Path, text: str) -> None:
-    temporary = path.with_name(f"{path.name}.tmp")
-    temporary.write_text(text, encoding="utf-8", newline="\n")
-    os.replace(temporary, path)
