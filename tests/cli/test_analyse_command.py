@@ -48,7 +48,7 @@ def test_evaluations_below_a_folder_are_those_of_the_split(folder, capsys, monke
 @pytest.mark.parametrize(
     ("names", "part"),
     [
-        (["{}"], "holds neither a run nor an evaluation on validation"),
+        (["{}"], "holds neither a run nor a study nor an evaluation on validation"),
         (["{}/nothing", "{}/nothing"], "was given twice"),
         (["=x"], "give FOLDER or LABEL=FOLDER"),
     ],

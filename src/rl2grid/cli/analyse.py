@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import argparse
 import shlex
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-from rl2grid.analysis.results import EVALUATION_FILE, EvaluationResult, load_evaluation
-from rl2grid.analysis.training import RUN_FILE, TrainingRun, read_training_run
+from rl2grid.analysis.sources import load_sources
 from rl2grid.errors import UsageError
 from rl2grid.scenarios.splits import SPLITS
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
 THEMES = ("light", "dark")
+SPLIT_HELP = "which evaluations are taken; by default those on validation, and all of a study"
 
 
 def add_parser(commands: Any) -> None:
@@ -28,16 +24,17 @@ def add_parser(commands: Any) -> None:
         "folders",
         nargs="+",
         metavar="folder",
-        help="an evaluation, or a run, whose evaluations on --split are taken too; LABEL=FOLDER names it",
+        help="an evaluation, a study, or a run, whose evaluations on --split are taken too; LABEL=FOLDER names it",
     )
     parser.add_argument("--output", type=Path, required=True, help="folder of the tables and figures")
-    parser.add_argument("--split", default="validation", choices=SPLITS, help="which evaluations of a run are taken")
+    parser.add_argument("--split", default=None, choices=SPLITS, help=SPLIT_HELP)
     parser.add_argument("--theme", default=THEMES[0], choices=THEMES, help="colours of the figures")
     parser.set_defaults(run=_run)
 
 
 def _run(options: argparse.Namespace) -> int:
-    results, runs = _load(options.folders, options.split)
+    sources = load_sources(options.folders, options.split)
+    results, runs = sources.results, sources.runs
     try:
         from rl2grid.analysis import section
         from rl2grid.drawing import theme as themes
@@ -55,52 +52,13 @@ def _run(options: argparse.Namespace) -> int:
             theme=themes.DARK if options.theme == "dark" else themes.LIGHT,
             on_file=lambda name: bar.update(task, advance=1, description=name),
         )
+    for sentence in sources.missing:
+        print(sentence)
     print(f"{len(plan.tables)} tables and {len(plan.pictures)} figures, listed in {index}.")
     return 0
 
 
-def _load(folders: Sequence[str], split: str) -> tuple[list[EvaluationResult], list[TrainingRun]]:
-    """Evaluations and runs, in the order given."""
-    results: list[EvaluationResult] = []
-    runs: list[TrainingRun] = []
-    for words in folders:
-        label, folder = _parse(words)
-        evaluations = _evaluations(folder, split)
-        results += [_named(load_evaluation(evaluation), label) for evaluation in evaluations]
-        if (folder / RUN_FILE).is_file():
-            runs.append(read_training_run(folder, label))
-        elif not evaluations:
-            raise UsageError(
-                f"{folder} holds neither a run nor an evaluation on {split}: give folders that 'rl2grid train' or "
-                "'rl2grid evaluate' wrote."
-            )
-    return results, runs
-
-
-def _evaluations(folder: Path, split: str) -> list[Path]:
-    """The folder itself, or those below it of the split, which 'rl2grid evaluate' names after what else was asked."""
-    if (folder / EVALUATION_FILE).is_file():
-        return [folder]
-    below = (folder / "evaluation").glob(f"{split}*")
-    return sorted(path for path in below if (path / EVALUATION_FILE).is_file())
-
-
-def _parse(words: str) -> tuple[str | None, Path]:
-    """Label and folder; a folder whose own name has an equals sign is a folder."""
-    label, equals, folder = words.partition("=")
-    if not equals or Path(words).exists():
-        return None, Path(words)
-    if not label or not folder:
-        raise UsageError(f"{words!r} is not allowed: give FOLDER or LABEL=FOLDER.")
-    return label, Path(folder)
-
-
-def _named(result: EvaluationResult, label: str | None) -> EvaluationResult:
-    if label is None:
-        return result
-    return replace(result, episodes=tuple(replace(episode, agent=label) for episode in result.episodes))
-
-
 def _command(options: argparse.Namespace) -> str:
-    words = ["rl2grid", "analyse", *options.folders, "--output", str(options.output), "--split", options.split]
+    words = ["rl2grid", "analyse", *options.folders, "--output", str(options.output)]
+    words += [] if options.split is None else ["--split", options.split]
     return shlex.join([*words, "--theme", options.theme])

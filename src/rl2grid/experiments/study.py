@@ -29,6 +29,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from rl2grid.analysis.sources import CELLS_FOLDER
 from rl2grid.engines import HEURISTICS
 from rl2grid.envs.tasks import TaskOptions, find_task
 from rl2grid.errors import UsageError
@@ -129,7 +130,7 @@ class Study:
 
     def folder(self, cell: Cell) -> Path:
         """Where a cell is kept."""
-        return self.output / "cells" / cell.name
+        return self.output / CELLS_FOLDER / cell.name
 
 
 def evenly_spread(task: str, split: str, months: int | None) -> tuple[str, ...]:

@@ -31,6 +31,7 @@ from filelock import FileLock, Timeout
 
 from rl2grid.analysis.episodes import EPISODES_FILE
 from rl2grid.analysis.results import load_evaluation
+from rl2grid.analysis.sources import CELL_FILE, EVALUATION_FOLDER, RESULT_FILE, RUN_FOLDER
 from rl2grid.errors import UsageError
 from rl2grid.experiments import runs
 from rl2grid.experiments.commands import flags
@@ -38,8 +39,7 @@ from rl2grid.experiments.evaluation import evaluate
 from rl2grid.experiments.study import Cell, Training, cell_from_dict, cell_to_dict
 from rl2grid.experiments.validation import validator
 
-CELL_FILE, RESULT_FILE, LOG_FILE, LOCK_FILE = "cell.json", "result.json", "log.txt", ".lock"
-RUN_FOLDER, EVALUATION_FOLDER = "run", "evaluation"
+LOG_FILE, LOCK_FILE = "log.txt", ".lock"
 METRICS_FILE = "metrics.csv"
 
 FINISHED, FAILED, REFUSED, BUSY, STOPPED = 0, 1, 2, 75, 130

@@ -27,17 +27,16 @@ from rich.table import Table
 from rich.text import Text
 
 from rl2grid.analysis.episodes import COLUMNS, EPISODES_FILE, format_row, read_episodes
+from rl2grid.analysis.sources import EVALUATION_FOLDER, RUN_FOLDER, STUDY_FILE
 from rl2grid.analysis.training import VALIDATION
 from rl2grid.experiments.interrupts import stop_requests
 from rl2grid.experiments.study import Cell, Study
 from rl2grid.experiments.study_backends import Backend, Job
 from rl2grid.experiments.study_cell import (
     BUSY,
-    EVALUATION_FOLDER,
     FINISHED,
     METRICS_FILE,
     REFUSED,
-    RUN_FOLDER,
     STOPPED,
     CellResult,
     commands,
@@ -50,7 +49,6 @@ from rl2grid.experiments.study_cell import (
 )
 from rl2grid.versions import library_versions
 
-STUDY_FILE = "study.json"
 _POLL_SECONDS = 0.5
 _BUSY_SECONDS = 5.0
 _AGENT_WORK = 5_000
