@@ -48,7 +48,7 @@ class Method:
     @property
     def label(self) -> str:
         """What tables and figures call it."""
-        return self.agent if self.heuristic == "none" else f"{self.agent} + {self.heuristic}"
+        return method_label(self.first)
 
     @property
     def is_trained(self) -> bool:
@@ -75,6 +75,11 @@ class Method:
     def safe(self, constraint: str) -> Scores:
         """1 for episodes that were completed as well: dying early is not safety."""
         return Scores(self.within(constraint).values * self.scores("completed").values)
+
+
+def method_label(episode: Episode) -> str:
+    """What tables and figures call the method of an episode."""
+    return episode.agent if episode.heuristic == "none" else f"{episode.agent} + {episode.heuristic}"
 
 
 def group_methods(results: Sequence[EvaluationResult]) -> dict[str, tuple[Method, ...]]:

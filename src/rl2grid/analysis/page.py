@@ -34,13 +34,13 @@ def table_html(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return scrolling(head, body)
 
 
-def result_table_html(table: ResultTable, links: Sequence[str] = (), heading: str = "made by") -> str:
+def result_table_html(table: ResultTable, *, links: Sequence[str] = (), made: str = "") -> str:
     """A table of results with its caption.
 
     Args:
         table: the table.
-        links: HTML of one more cell at the end of each row; none: there is no such column.
-        heading: of that column.
+        links: HTML of one more cell at the end of each row, which says what made it; none: there is no such column.
+        made: HTML behind the caption, which says what made the table.
     """
     grouped = any(column.group for column in table.columns)
     groups = ""
@@ -51,14 +51,15 @@ def result_table_html(table: ResultTable, links: Sequence[str] = (), heading: st
         groups = f"<tr>{groups}{'<th></th>' if links else ''}</tr>"
     words = [" class=words" if column.words else "" for column in table.columns]
     head = "".join(f"<th{w}>{html.escape(c.heading)}</th>" for c, w in zip(table.columns, words, strict=True))
-    head += f"<th class=words>{html.escape(heading)}</th>" if links else ""
+    head += "<th class=words>Made by</th>" if links else ""
     rows = []
     for number, row in enumerate(table.rows):
         cells = "".join(f"<td{w}>{_result_cell(cell)}</td>" for cell, w in zip(row, words, strict=True))
-        rows.append(f"<tr>{cells}{f'<td class=words>{links[number]}</td>' if links else ''}</tr>")
+        cells += f"<td class='words links'>{links[number]}</td>" if links else ""
+        rows.append(f"<tr>{cells}</tr>")
     return (
         f"<div class=scroll><table class=typed><thead>{groups}<tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody>"
-        f"</table></div><p class=note>{html.escape(table.caption)}</p>"
+        f"</table></div><p class=note>{html.escape(table.caption)}{made}</p>"
     )
 
 

@@ -18,7 +18,7 @@ from rl2grid.analysis.statistics import (
     optimality_gap,
     probability_of_improvement,
 )
-from rl2grid.analysis.tables import MISSING, Cell, Column, ResultTable, interval_cell, mean_cell
+from rl2grid.analysis.tables import MISSING, Cell, Column, ResultTable, interval_cell, mean_cell, share_cell
 from rl2grid.mdp.constraints import THRESHOLDS
 from rl2grid.mdp.termination import GAME_OVER_TEXT, GameOver
 
@@ -47,6 +47,39 @@ def result_tables(methods: Methods) -> tuple[ResultTable, ...]:
     if any(len(group) > 1 for group in methods.values()):
         tables.append(comparison_table(methods))
     return tuple(tables)
+
+
+def ranking_table(methods: Sequence[Method]) -> ResultTable:
+    """The methods of one task by survival, highest first, and how often they completed an episode, also safely."""
+    limits = (methods[0].task.constraint,) if methods[0].task.constraint else tuple(THRESHOLDS)
+    headings = ("Survival", "Completed", *(f"Safe {name}" for name in limits), "Runs", "Scenarios", "Seeds", "Episodes")
+    columns = (Column("Method", words=True), *(Column(heading) for heading in headings))
+    ranked = ranking(methods)
+    rows = []
+    for method in ranked:
+        survival = method.scores("survival")
+        runs, scenarios, seeds = survival.values.shape
+        shares = (method.scores("completed"), *(method.safe(name) for name in limits))
+        first = interval_cell(estimate(survival), best=method is ranked[0] and len(ranked) > 1)
+        cells = (first, *(share_cell(estimate(scores)) for scores in shares))
+        counts = (
+            str(runs) if method.is_trained else MISSING.text,
+            str(scenarios),
+            str(seeds),
+            str(len(method.episodes)),
+        )
+        rows.append((Cell(method.label), *cells, *(Cell(text) for text in counts)))
+    kept = " or ".join(f"{name} at most {THRESHOLDS[name]:g}" for name in limits)
+    caption = (
+        "Mean share of the episode survived, and shares of episodes completed, with 95% bootstrap intervals over "
+        f"{resampled_units(methods)}. Safe: completed, and cost {kept}. Runs: trainings of the method."
+    )
+    return ResultTable(f"ranking-{_task_name(methods[0])}", caption, columns, tuple(rows))
+
+
+def ranking(methods: Sequence[Method]) -> list[Method]:
+    """Methods by mean survival, highest first; equal ones in their order."""
+    return sorted(methods, key=lambda method: -float(method.scores("survival").values.mean()))
 
 
 def survival_table(methods: Methods, kind: str) -> ResultTable:

@@ -10,7 +10,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from matplotlib.figure import Figure
@@ -42,6 +42,8 @@ class Picture:
     """Of its files."""
     caption: str
     draw: Callable[[Theme], Figure]
+    task: str = ""
+    """Id of the task that it is about; empty where it is about several."""
 
 
 @dataclass(frozen=True)
@@ -116,6 +118,7 @@ def training_pictures(curves: CurvesByTask) -> Iterator[Picture]:
             lambda theme, runs=runs, short=short: figures.training_curves(  # type: ignore[misc]
                 runs, theme=theme, title=f"Survival in training: {short}"
             ),
+            task,
         )
         for name, panels, words in (
             ("scores", SCORE_PANELS, "Operational scores"),
@@ -128,13 +131,15 @@ def training_pictures(curves: CurvesByTask) -> Iterator[Picture]:
                     lambda theme, group=group, panels=panels, title=f"{words}: {short}": draw_panels(  # type: ignore[misc]
                         group, panels, title=title, theme=theme
                     ),
+                    task,
                 )
 
 
 def evaluation_pictures(methods: Methods) -> Iterator[Picture]:
     """Figures of evaluations: of every task, and of grids that were played on several levels."""
     for task, group in methods.items():
-        yield from _task_pictures(_short(task), tuple(group))
+        for picture in _task_pictures(_short(task), tuple(group)):
+            yield replace(picture, task=task)
     for grid, group in _by_grid(methods).items():
         yield _of_methods("levels", grid, group, "Survival on the levels of difficulty of", compare.draw_levels)
 

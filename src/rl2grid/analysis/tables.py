@@ -68,6 +68,12 @@ def interval_cell(estimate: Estimate, *, digits: int = 3, best: bool = False) ->
     return Cell(_with_interval(estimate, digits), estimate, best)
 
 
+def share_cell(estimate: Estimate) -> Cell:
+    """A share and both ends of its interval, as "97% [95, 99]"."""
+    text = f"{100 * estimate.value:.0f}% [{100 * estimate.low:.0f}, {100 * estimate.high:.0f}]"
+    return Cell(text, estimate)
+
+
 def table_markdown(table: ResultTable) -> str:
     """A table as Markdown; a column of a group is headed "group heading"."""
     headings = [f"{column.group} {column.heading}".strip() for column in table.columns]

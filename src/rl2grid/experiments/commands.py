@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Mapping
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 from rl2grid.envs.tasks import TaskOptions
@@ -33,6 +34,16 @@ def train_command(args: runs.RunArgs, preset: str = "default") -> str:
     if args.evaluate_every != runs.RunArgs.evaluate_every:
         words += ["--evaluate-every", str(args.evaluate_every)]
     return shlex.join(words)
+
+
+def training_command(folder: Path) -> str:
+    """The command that makes the run in ``folder`` again.
+
+    Raises:
+        UsageError: the folder holds no run.
+    """
+    args, _ = runs.read_config(folder)
+    return f"{train_command(args)} {shlex.join(('--folder', str(folder)))}"
 
 
 def flags(values: Mapping[str, Any]) -> list[str]:

@@ -1,0 +1,95 @@
+"""``rl2grid report``: everything that evaluations, runs and studies say, as one HTML page."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+from rl2grid.analysis.sources import Sources, load_sources
+from rl2grid.analysis.training import TrainingRun
+from rl2grid.cli.analyse import SPLIT_HELP
+from rl2grid.errors import UsageError
+from rl2grid.scenarios.splits import SPLITS
+
+PAGE_FILE = "report.html"
+
+
+def add_parser(commands: Any) -> None:
+    """Add the subcommand to those of ``rl2grid``."""
+    parser = commands.add_parser("report", help="one HTML page with all results, figures, episodes and commands")
+    parser.add_argument(
+        "folders",
+        nargs="+",
+        metavar="folder",
+        help="a study, an evaluation, or a run, whose evaluations on --split are taken too; LABEL=FOLDER names it",
+    )
+    parser.add_argument("--output", type=Path, default=Path("report"), help="folder of the page")
+    parser.add_argument("--split", default=None, choices=SPLITS, help=SPLIT_HELP)
+    parser.add_argument("--title", default=None, help="headline; by default what was played")
+    parser.set_defaults(run=_run)
+
+
+def _run(options: argparse.Namespace) -> int:
+    sources = load_sources(options.folders, options.split)
+    try:
+        from rl2grid.analysis import results_page
+    except ImportError as error:
+        raise UsageError(f"Reports need {error.name}: install it with `pip install rl2grid[analysis]`.") from None
+    number = results_page.number_of_figures(sources)
+    train_commands = _train_commands(sources.runs)
+    path = _page_path(options.output)
+    with Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), transient=True) as bar:
+        task = bar.add_task("Drawing", total=number)
+        size = results_page.write_results_page(
+            path,
+            sources,
+            title=options.title or _title(sources),
+            command=_command(options),
+            train_commands=train_commands,
+            on_figure=lambda name: bar.update(task, advance=1, description=name),
+        )
+    for sentence in sources.missing:
+        print(sentence)
+    print(f"{number} figures, {sum(len(result.episodes) for result in sources.results):,} episodes.")
+    print(f"Written: {path} ({size / 1e6:.1f} MB).")
+    return 0
+
+
+def _train_commands(runs: Sequence[TrainingRun]) -> dict[Path, str]:
+    if not runs:
+        return {}
+    try:
+        from rl2grid.experiments.commands import training_command
+    except ImportError as error:
+        raise UsageError(f"Reports of runs need {error.name}: install it with `pip install rl2grid[train]`.") from None
+    return {run.folder: training_command(run.folder) for run in runs}
+
+
+def _page_path(folder: Path) -> Path:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"Folder {folder} cannot be made: {error.strerror}.") from None
+    return folder / PAGE_FILE
+
+
+def _title(sources: Sources) -> str:
+    tasks = list(
+        dict.fromkeys(
+            [*(str(result.identity["task"]) for result in sources.results), *(run.task for run in sources.runs)]
+        )
+    )
+    if len(tasks) > 3:
+        return f"Results on {len(tasks)} tasks"
+    return f"Results on {', '.join(task.removeprefix('rl2grid/').removesuffix('-v0') for task in tasks)}"
+
+
+def _command(options: argparse.Namespace) -> str:
+    words = ["rl2grid", "report", *options.folders, "--output", str(options.output)]
+    words += [] if options.split is None else ["--split", options.split]
+    return shlex.join([*words, *([] if options.title is None else ["--title", options.title])])
