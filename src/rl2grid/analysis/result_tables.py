@@ -50,36 +50,62 @@ def result_tables(methods: Methods) -> tuple[ResultTable, ...]:
 
 
 def ranking_table(methods: Sequence[Method]) -> ResultTable:
-    """The methods of one task by survival, highest first, and how often they completed an episode, also safely."""
-    limits = (methods[0].task.constraint,) if methods[0].task.constraint else tuple(THRESHOLDS)
-    headings = ("Survival", "Completed", *(f"Safe {name}" for name in limits), "Runs", "Scenarios", "Seeds", "Episodes")
-    columns = (Column("Method", words=True), *(Column(heading) for heading in headings))
+    """The methods of one task, best first: how long they survive, and how often they complete an episode, also safely.
+
+    Args:
+        methods: all of one task, at least one.
+    """
     ranked = ranking(methods)
-    rows = []
-    for method in ranked:
-        survival = method.scores("survival")
-        runs, scenarios, seeds = survival.values.shape
-        shares = (method.scores("completed"), *(method.safe(name) for name in limits))
-        first = interval_cell(estimate(survival), best=method is ranked[0] and len(ranked) > 1)
-        cells = (first, *(share_cell(estimate(scores)) for scores in shares))
-        counts = (
-            str(runs) if method.is_trained else MISSING.text,
-            str(scenarios),
-            str(seeds),
-            str(len(method.episodes)),
-        )
-        rows.append((Cell(method.label), *cells, *(Cell(text) for text in counts)))
-    kept = " or ".join(f"{name} at most {THRESHOLDS[name]:g}" for name in limits)
-    caption = (
-        "Mean share of the episode survived, and shares of episodes completed, with 95% bootstrap intervals over "
-        f"{resampled_units(methods)}. Safe: completed, and cost {kept}. Runs: trainings of the method."
-    )
-    return ResultTable(f"ranking-{_task_name(methods[0])}", caption, columns, tuple(rows))
+    return _ranking_table([(Cell(method.label),) for method in ranked], (Column("Method", words=True),), ranked)
+
+
+def entry_table(methods: Mapping[str, Method]) -> ResultTable:
+    """:func:`ranking_table` of the entries of a leaderboard, with their files.
+
+    Args:
+        methods: by file, all of one task, at least one.
+    """
+    ranked = ranking(tuple(methods.values()))
+    files = {id(method): file for file, method in methods.items()}
+    names = [(Cell(method.label), Cell(files[id(method)])) for method in ranked]
+    return _ranking_table(names, (Column("Method", words=True), Column("Entry", words=True)), ranked)
 
 
 def ranking(methods: Sequence[Method]) -> list[Method]:
-    """Methods by mean survival, highest first; equal ones in their order."""
-    return sorted(methods, key=lambda method: -float(method.scores("survival").values.mean()))
+    """Methods of one task, best first: by survival; under a constraint by the share of safe episodes before that."""
+    limit = methods[0].task.constraint
+
+    def score(method: Method) -> tuple[float, ...]:
+        scores = (*((method.safe(limit),) if limit else ()), method.scores("survival"))
+        return tuple(-float(one.values.mean()) for one in scores)
+
+    return sorted(methods, key=score)
+
+
+def _ranking_table(
+    names: Sequence[tuple[Cell, ...]], name_columns: tuple[Column, ...], ranked: Sequence[Method]
+) -> ResultTable:
+    limit = ranked[0].task.constraint
+    limits = (limit,) if limit else tuple(THRESHOLDS)
+    headings = ("Survival", "Completed", *(f"Safe {name}" for name in limits), "Runs", "Scenarios", "Seeds", "Episodes")
+    rows = []
+    for place, (name, method) in enumerate(zip(names, ranked, strict=True)):
+        survival = method.scores("survival")
+        shares = (method.scores("completed"), *(method.safe(name) for name in limits))
+        first = interval_cell(estimate(survival), best=place == 0 and len(ranked) > 1)
+        cells = (first, *(share_cell(estimate(scores)) for scores in shares))
+        counts = [str(number) for number in (*survival.values.shape, len(method.episodes))]
+        if not method.is_trained:
+            counts[0] = MISSING.text
+        rows.append((*name, *cells, *(Cell(text) for text in counts)))
+    kept = " or ".join(f"{name} at most {THRESHOLDS[name]:g}" for name in limits)
+    order = "share of safe episodes, then survival" if limit else "survival"
+    caption = (
+        f"By {order}. Survival: mean share of the episode; others: shares of episodes. Intervals: 95%, bootstrap over "
+        f"{resampled_units(ranked)}. Safe: completed, and cost {kept}. Runs: trainings of the method."
+    )
+    columns = (*name_columns, *(Column(heading) for heading in headings))
+    return ResultTable(f"ranking-{_task_name(ranked[0])}", caption, columns, tuple(rows))
 
 
 def survival_table(methods: Methods, kind: str) -> ResultTable:

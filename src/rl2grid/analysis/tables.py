@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import rich.box
 from rich.table import Table
+from rich.text import Text
 
 from rl2grid.analysis.statistics import Estimate
 from rl2grid.analysis.summary import Summary
@@ -72,6 +73,26 @@ def share_cell(estimate: Estimate) -> Cell:
     """A share and both ends of its interval, as "97% [95, 99]"."""
     text = f"{100 * estimate.value:.0f}% [{100 * estimate.low:.0f}, {100 * estimate.high:.0f}]"
     return Cell(text, estimate)
+
+
+def result_table_rich(table: ResultTable, title: str | None = None) -> Table:
+    """A table for the terminal, with its caption."""
+    shown = Table(
+        title=title or table.name,
+        title_justify="left",
+        title_style="bold",
+        caption=table.caption,
+        caption_justify="left",
+        box=rich.box.SIMPLE_HEAD,
+        pad_edge=False,
+        padding=(0, 1, 0, 0),
+    )
+    for column in table.columns:
+        heading = f"{column.group} {column.heading}".strip()
+        shown.add_column(heading, justify="left" if column.words else "right", no_wrap=not column.words)
+    for row in table.rows:
+        shown.add_row(*(Text(cell.text, style="bold" if cell.best else "") for cell in row))
+    return shown
 
 
 def table_markdown(table: ResultTable) -> str:

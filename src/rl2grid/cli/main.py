@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from rl2grid import __version__
-from rl2grid.cli import actions, analyse, data, report, study, watch
+from rl2grid.cli import actions, analyse, data, leaderboard, report, study, watch
 from rl2grid.cli.train import INTERRUPTED, train
 from rl2grid.engines import ENGINES, HEURISTICS
 from rl2grid.envs.tasks import CONSTRAINTS
@@ -71,6 +71,7 @@ def make_parser() -> argparse.ArgumentParser:
     _add_rank(commands)
     analyse.add_parser(commands)
     report.add_parser(commands)
+    leaderboard.add_parser(commands)
     actions.add_parser(commands)
     data.add_parser(commands)
     watch.add_parser(commands)

@@ -187,22 +187,27 @@ def _jobs(scenarios: Sequence[str], seeds: Sequence[int], start: int) -> list[Jo
 def _identity(
     task: Task, agent: Agent, name: str, keywords: Mapping[str, Any], start: int, scenarios: Sequence[str]
 ) -> dict[str, Any]:
+    who = {"task": task.id, "agent": name, "agent_identity": getattr(agent, "identity", None)}
+    return {**who, **question(task, keywords, start, scenarios), "versions": library_versions()}
+
+
+def question(task: Task, keywords: Mapping[str, Any], start: int, scenarios: Sequence[str]) -> dict[str, Any]:
+    """What an evaluation asks of an agent, as it stands in its identity: options, data and actions.
+
+    Raises:
+        UsageError: a keyword or a scenario does not exist.
+    """
     options = asdict(TaskOptions(**keywords))
     reward = options["reward"]
     options["reward"] = f"{reward.__module__}.{reward.__qualname__}" if callable(reward) else reward
-    constraint = constraint_of(task, options["constraint"])
     return {
-        "task": task.id,
-        "agent": name,
-        "agent_identity": getattr(agent, "identity", None),
         **{key: value for key, value in options.items() if key not in ("scenario", "gamma")},
-        "constraint": constraint,
+        "constraint": constraint_of(task, options["constraint"]),
         "start": start,
         "grid_hash": task.grid.hash,
         "generator_version": generator_version(options["split"]),
         "scenario_pack_hash": scenario_pack_hash(task.grid_id, options["split"], scenarios),
         "action_set_hash": action_set_hash(task.grid, task.level) if task.kind == "T" else None,
-        "versions": library_versions(),
     }
 
 

@@ -1,0 +1,135 @@
+"""``rl2grid leaderboard``: evaluations as files that anyone can play again, and their ranking."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from rl2grid.analysis.entries import Entry, read_entry, write_entry
+from rl2grid.analysis.methods import Method
+from rl2grid.analysis.results import check_comparable
+from rl2grid.analysis.tables import result_table_rich
+from rl2grid.errors import UsageError
+from rl2grid.scenarios.splits import SPLITS
+
+if TYPE_CHECKING:
+    from rl2grid.analysis.results import EvaluationResult
+
+DIFFERENT = 1
+"""Exit status when an entry is not what its actions make."""
+
+
+def add_parser(commands: Any) -> None:
+    """Add the subcommand to those of ``rl2grid``."""
+    parser = commands.add_parser("leaderboard", help="entries that anyone can play again, and their ranking")
+    parser.set_defaults(run=lambda options: _print_help(parser))
+    actions = parser.add_subparsers(dest="action", metavar="action")
+    _add_entry(actions)
+    _add_verify(actions)
+    _add_table(actions)
+
+
+def _print_help(parser: argparse.ArgumentParser) -> int:
+    parser.print_help()
+    return 0
+
+
+def _add_entry(actions: Any) -> None:
+    parser = actions.add_parser("entry", help="write an evaluation with all its actions as one file")
+    parser.add_argument("folder", type=Path, help="an evaluation, a run that was evaluated, or a cell of a study")
+    parser.add_argument("--output", type=Path, required=True, help="the file")
+    parser.add_argument("--split", default="validation", choices=SPLITS, help="which evaluation of a run is taken")
+    parser.add_argument("--label", default=None, help="what tables call the agent; by default as in the evaluation")
+    parser.add_argument("--agent", default=None, help="name, run or checkpoint; by default found by the evaluation")
+    parser.set_defaults(run=_entry)
+
+
+def _add_verify(actions: Any) -> None:
+    parser = actions.add_parser("verify", help="play the actions of entries again and compare")
+    parser.add_argument("files", nargs="+", type=Path, metavar="file", help="entries")
+    parser.set_defaults(run=_verify)
+
+
+def _add_table(actions: Any) -> None:
+    parser = actions.add_parser("table", help="rank entries by survival, as they are stored")
+    parser.add_argument("files", nargs="+", type=Path, metavar="file", help="entries")
+    parser.set_defaults(run=_table)
+
+
+def _entry(options: argparse.Namespace) -> int:
+    from rl2grid.analysis.results import load_evaluation
+    from rl2grid.experiments.leaderboard import find_evaluation, make_entry
+
+    folder = find_evaluation(options.folder, options.split)
+    if not options.output.parent.is_dir():
+        raise UsageError(f"Folder {options.output.parent} of the output does not exist.")
+    with _playing("Playing", len(load_evaluation(folder).episodes)) as show:
+        entry = make_entry(folder, agent=options.agent, label=options.label, on_progress=show)
+    write_entry(options.output, entry)
+    decisions = sum(len(episode.actions) for episode in entry.episodes)
+    size = options.output.stat().st_size
+    print(f"{len(entry.episodes)} episodes with {decisions:,} actions, as evaluated.")
+    print(f"Written: {options.output} ({size / 1000:,.0f} kB).")
+    return 0
+
+
+def _verify(options: argparse.Namespace) -> int:
+    from rl2grid.experiments.leaderboard import check_entry, verify_entry
+
+    entries = _read(options.files)
+    for path, entry in entries.items():
+        check_entry(entry, str(path))
+    different = 0
+    for path, entry in entries.items():
+        with _playing(f"Playing {path.name}", len(entry.episodes)) as show:
+            difference = verify_entry(entry, show)
+        if difference:
+            different += 1
+            print(f"rl2grid: {path} is not verified: {difference}.", file=sys.stderr)
+        else:
+            survival = entry.result.summary.survival.value
+            print(f"{path} is verified: {len(entry.episodes)} episodes, survival {survival:.3f}, exactly as stored.")
+    return DIFFERENT if different else 0
+
+
+def _table(options: argparse.Namespace) -> int:
+    from rl2grid.analysis.result_tables import entry_table
+
+    by_task: dict[str, dict[Path, EvaluationResult]] = {}
+    for path, entry in _read(options.files).items():
+        by_task.setdefault(entry.identity["task"], {})[path] = entry.result
+    for results in by_task.values():
+        check_comparable(list(results.values()))
+    console = Console()
+    # A table cut to the width of a pipe would lose columns.
+    wide = console if console.is_terminal else Console(width=160)
+    for task, results in by_task.items():
+        methods = {str(path): Method((result,)) for path, result in results.items()}
+        wide.print(result_table_rich(entry_table(methods), title=task.removeprefix("rl2grid/")))
+    print("As stored: 'rl2grid leaderboard verify' plays the actions again.")
+    return 0
+
+
+def _read(paths: Sequence[Path]) -> dict[Path, Entry]:
+    entries: dict[Path, Entry] = {}
+    for path in paths:
+        if path in entries:
+            raise UsageError(f"{path} was given twice: leave one out.")
+        entries[path] = read_entry(path)
+    return entries
+
+
+@contextmanager
+def _playing(words: str, episodes: int) -> Iterator[Callable[[float], None]]:
+    """A progress bar, to be told how many episodes were played."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, transient=True) as bar:
+        task = bar.add_task(words, total=episodes)
+        yield lambda played: bar.update(task, completed=played)
