@@ -11,7 +11,7 @@ from rich.console import Console
 from rl2grid.analysis.tables import rich_table
 from rl2grid.engines import ENGINES
 from rl2grid.envs.tasks import find_task
-from rl2grid.experiments.evaluation import AS_TRAINED, evaluate
+from rl2grid.experiments.evaluation import AS_TRAINED, evaluate, evenly_spread
 
 
 def run(options: argparse.Namespace) -> int:
@@ -27,6 +27,7 @@ def run(options: argparse.Namespace) -> int:
         options.agent,
         task.id,
         split=options.split,
+        scenarios=None if options.months is None else evenly_spread(task.id, options.split, options.months),
         seeds=range(options.seeds),
         heuristic=heuristic,
         constraint=None if options.constraint == "None" else options.constraint,
@@ -46,6 +47,8 @@ def _default_output(options: argparse.Namespace, task: str) -> Path:
     name = options.split if options.heuristic is None else f"{options.split}-{options.heuristic}"
     if options.constraint not in (None, "None"):
         name = f"{name}-{options.constraint}"
+    if options.months is not None:
+        name = f"{name}-{options.months}-months"
     if options.engine != ENGINES[0]:
         name = f"{name}-{options.engine}"
     path = Path(options.agent)
@@ -59,6 +62,8 @@ def _default_output(options: argparse.Namespace, task: str) -> Path:
 def _command(options: argparse.Namespace) -> str:
     words = ["rl2grid", "evaluate", str(options.agent), options.task, "--split", options.split]
     words += ["--seeds", str(options.seeds)]
+    if options.months is not None:
+        words += ["--months", str(options.months)]
     if options.heuristic is not None:
         words += ["--heuristic", options.heuristic]
     if options.constraint is not None:

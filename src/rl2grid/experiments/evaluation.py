@@ -102,6 +102,19 @@ def evaluate(
     )
 
 
+def evenly_spread(task_id: str, split: str, months: int | None) -> tuple[str, ...]:
+    """Some months of a split, evenly spread over it; ``months`` None, or more than there are: all.
+
+    Raises:
+        UsageError: no such task or split, or a number of months below 1.
+    """
+    if months is not None and months < 1:
+        raise UsageError(f"months={months} is not allowed: give a number of months, at least 1.")
+    listed = list_scenarios(find_task(task_id).grid_id, split)
+    number = min(months or len(listed), len(listed))
+    return tuple(listed[k * len(listed) // number] for k in range(number))
+
+
 def run_evaluation(
     setting: Setting,
     jobs: Sequence[Job],

@@ -35,6 +35,7 @@ from rl2grid.envs.tasks import TaskOptions, find_task
 from rl2grid.errors import UsageError
 from rl2grid.experiments import runs
 from rl2grid.experiments.agents import AGENTS
+from rl2grid.experiments.evaluation import evenly_spread
 from rl2grid.experiments.study_file import (
     as_table,
     check_kind,
@@ -48,7 +49,6 @@ from rl2grid.experiments.study_file import (
     with_tuples,
 )
 from rl2grid.mdp.rewards import resolve_reward
-from rl2grid.scenarios.library import list_scenarios
 from rl2grid.scenarios.splits import SPLITS
 
 NO_HEURISTIC = "none"
@@ -131,13 +131,6 @@ class Study:
     def folder(self, cell: Cell) -> Path:
         """Where a cell is kept."""
         return self.output / CELLS_FOLDER / cell.name
-
-
-def evenly_spread(task: str, split: str, months: int | None) -> tuple[str, ...]:
-    """Some months of a split, evenly spread over it; ``months`` None: all."""
-    listed = list_scenarios(find_task(task).grid_id, split)
-    number = min(months or len(listed), len(listed))
-    return tuple(listed[k * len(listed) // number] for k in range(number))
 
 
 def included_studies() -> dict[str, Path]:

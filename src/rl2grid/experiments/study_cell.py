@@ -112,6 +112,7 @@ def commands(folder: Path, cell: Cell) -> list[str]:
         lines.append(shlex.join([*train, "--folder", str(run)]))
     agent = cell.agent if training is None else str(run)
     play = [*words, "evaluate", agent, cell.task, "--split", cell.split, "--seeds", str(cell.evaluation_seeds)]
+    play += [] if cell.months is None else ["--months", str(cell.months)]
     lines.append(shlex.join([*play, "--heuristic", cell.heuristic or "None"]))
     return lines
 

@@ -38,8 +38,9 @@ from rl2grid.envs.tasks import find_task
 from rl2grid.errors import UsageError
 from rl2grid.experiments import runs
 from rl2grid.experiments.commands import train_command
+from rl2grid.experiments.evaluation import evenly_spread
 from rl2grid.experiments.interrupts import stop_requests
-from rl2grid.experiments.study import NO_HEURISTIC, evenly_spread
+from rl2grid.experiments.study import NO_HEURISTIC
 from rl2grid.experiments.study_cell import STOPPED, CellProcess, is_busy, serve, write_json
 from rl2grid.experiments.study_file import as_table, count, read_toml, refuse_unknown_keys, text, unknown
 from rl2grid.experiments.validation import validator
