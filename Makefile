@@ -24,10 +24,10 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --progress-bar on --constraint constraints.txt --editable ".[train,analysis,docs,dev]"
 	@touch $@
 
-# RLlib and TorchRL are large: only the longer tests need them.
+# RLlib and TorchRL are large, and a browser is driven by the longer tests alone.
 $(VENV)/.installed-examples: $(VENV)/.installed
-	@echo "== Installing the libraries of the examples (about a minute)"
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --progress-bar on --constraint constraints.txt --editable ".[examples]"
+	@echo "== Installing the libraries of the examples and of the tests in a browser (about a minute)"
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --progress-bar on --constraint constraints.txt --editable ".[examples,browser]"
 	@touch $@
 
 demo: $(VENV)/.installed

@@ -1,0 +1,103 @@
+"""Pages in a real browser: that they are whole, fit a phone, need no network, and that the table of episodes works."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from headless_browser import DESK, PHONE, visiting
+from sample_results import curve, result
+from test_watching import made_up
+
+from rl2grid.analysis.results_page import write_results_page
+from rl2grid.analysis.sources import Sources
+from rl2grid.analysis.training import TrainingRun
+from rl2grid.analysis.watch_page import write_watch_page
+from rl2grid.grids import load_grid
+
+pytestmark = pytest.mark.slow
+
+N_SCENARIOS, N_SEEDS = 100, 15
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A page of 3,000 episodes of two methods, one of which is never lost."""
+    random = np.random.default_rng(0)
+    lost = random.uniform(0, 0.9, (N_SCENARIOS, N_SEEDS)).tolist()
+    results = [
+        result("a-policy-with-a-rather-long-name", [[1.0] * N_SEEDS] * N_SCENARIOS, "recovery", agent_hash="a"),
+        result("do-nothing", lost),
+    ]
+    run = TrainingRun(Path("runs/one"), "rl2grid/bus14-T0-v0", {}, 1, curve())
+    path = tmp_path_factory.mktemp("page") / "report.html"
+    command = "rl2grid report " + " ".join(f"a-folder-{k}" for k in range(20))
+    write_results_page(
+        path, Sources(results, [run]), title="Some results", command=command, train_commands={run.folder: "train"}
+    )
+    return path
+
+
+@pytest.fixture(scope="module")
+def watch(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("page") / "watch.html"
+    grid = load_grid("bus14")
+    write_watch_page(path, grid, made_up(grid, 40))
+    return path
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("size", [PHONE, DESK])
+@pytest.mark.parametrize("name", ["report", "watch"])
+def test_pages_are_whole_and_fit(name, size, scheme, request):
+    with visiting(request.getfixturevalue(name), size, scheme) as visit:
+        assert visit.errors == []
+        assert visit.requests == []
+        assert visit.overflow == 0
+        paper = visit.page.evaluate("getComputedStyle(document.body).backgroundColor")
+        assert paper == ("rgb(255, 255, 255)" if scheme == "light" else "rgb(21, 24, 28)")
+
+
+def test_the_table_of_episodes_sorts_and_filters(report):
+    def column(name: str) -> list[str]:
+        places = page.locator("#explorer th").evaluate_all("all => all.map(one => one.dataset.name)")
+        return page.locator(f"#explorer tbody td:nth-child({places.index(name) + 1})").all_inner_texts()
+
+    with visiting(report, DESK) as visit:
+        page = visit.page
+        assert page.locator("#shown").inner_text().startswith("3,000 of 3,000 episodes")
+        page.get_by_role("button", name="Survival").click()
+        shown = [float(text) for text in column("survival")]
+        assert len(shown) == 50
+        assert shown == sorted(shown)
+        assert shown[-1] < 0.1
+        page.get_by_role("button", name="Survival").click()
+        assert set(column("survival")) == {"1"}
+        page.locator("#method").select_option("do-nothing")
+        assert set(column("method")) == {"do-nothing"}
+        assert page.locator("#shown").inner_text().startswith("1,500 of 3,000 episodes")
+        page.locator("#search").fill("survival<0.5 seed=3")
+        assert set(column("seed")) == {"3"}
+        assert all(float(text) < 0.5 for text in column("survival"))
+        page.locator("#search").fill("nothing of the kind")
+        assert page.locator("#shown").inner_text().startswith("0 of 3,000 episodes")
+        assert visit.errors == []
+
+
+def test_pages_of_the_table_turn_and_lead_to_commands(report):
+    with visiting(report, PHONE) as visit:
+        page = visit.page
+        assert page.locator("#previous").is_disabled()
+        page.locator("#next").click()
+        assert page.locator("#page").inner_text() == "51 to 100"
+        page.locator("#explorer tbody a").first.click()
+        assert page.url.endswith("#e1")
+        assert page.locator("#e1").is_visible()
+
+
+def test_the_slider_of_an_episode_moves_the_clock(watch):
+    with visiting(watch, PHONE) as visit:
+        before = visit.page.locator("#clock").inner_text()
+        visit.page.keyboard.press("Shift+ArrowRight")
+        assert visit.page.locator("#clock").inner_text() != before

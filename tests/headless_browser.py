@@ -1,0 +1,53 @@
+"""A headless browser for tests of pages, where there is one."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
+PHONE, DESK = (390, 844), (1280, 900)
+
+
+@dataclass
+class Visit:
+    """A page that was opened."""
+
+    page: Any
+    """Playwright's."""
+    errors: list[str] = field(default_factory=list)
+    """What the console and scripts complained about."""
+    requests: list[str] = field(default_factory=list)
+    """What was fetched beside the page itself."""
+
+    @property
+    def overflow(self) -> int:
+        """Pixels by which the page is wider than the screen."""
+        return int(self.page.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth"))
+
+
+@contextmanager
+def visiting(path: Path, size: tuple[int, int], scheme: str = "light") -> Iterator[Visit]:
+    """Open a page of this machine; the test is skipped where no browser is found."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: rl2grid[browser]")
+    found = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if found is None:
+        pytest.skip(f"no headless browser is installed: none of {', '.join(BROWSERS)} is on the path")
+    with playwright.sync_playwright() as library:
+        # Without a sandbox of its own: tests may run as root, and open nothing but files that they wrote.
+        browser = library.chromium.launch(executable_path=found, args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": size[0], "height": size[1]}, color_scheme=scheme)
+        visit = Visit(page)
+        page.on("console", lambda message: visit.errors.append(message.text) if message.type == "error" else None)
+        page.on("pageerror", lambda error: visit.errors.append(str(error)))
+        page.on("request", lambda request: visit.requests.append(request.url))
+        page.goto(path.as_uri())
+        visit.requests = [url for url in visit.requests if url != path.as_uri() and not url.startswith("data:")]
+        yield visit
+        browser.close()
