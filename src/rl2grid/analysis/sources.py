@@ -5,7 +5,7 @@ A folder is one of
 - an evaluation, as ``rl2grid evaluate`` writes it;
 - a run, as ``rl2grid train`` writes it; the evaluations below it are taken too;
 - a folder with evaluations in ``evaluation/``, such as that of an agent without training;
-- a study, as ``rl2grid study run`` writes it: the run and the evaluation of every finished cell.
+- a study, as ``rl2grid study run`` writes it: the run and the evaluation of every finished cell; or one of its cells.
 """
 
 from __future__ import annotations
@@ -52,12 +52,14 @@ def load_sources(folders: Sequence[str], split: str | None = None) -> Sources:
         if not folder.is_dir():
             raise UsageError(f"{folder} is no folder: give folders that 'rl2grid' wrote.")
         study = _study_folder(folder)
-        if study is None:
-            _add_folder(sources, folder, label, split or VALIDATION)
-        elif label is None:
-            _add_study(sources, study, split)
-        else:
+        if study is not None and label is not None:
             raise UsageError(f"A study has names of its own: give {folder} without {label}=.")
+        if study is not None:
+            _add_study(sources, study, split)
+        elif (folder / CELL_FILE).is_file():
+            _add_cell(sources, folder, label)
+        else:
+            _add_folder(sources, folder, label, split or VALIDATION)
     return sources
 
 
@@ -111,25 +113,31 @@ def _study_folder(folder: Path) -> Path | None:
 
 
 def _add_study(sources: Sources, folder: Path, split: str | None) -> None:
-    names = [entry["cell"] for entry in _read_json(folder / STUDY_FILE)["cells"]]
     taken = 0
-    for name in names:
-        cell = folder / CELLS_FOLDER / name
+    for entry in _read_json(folder / STUDY_FILE)["cells"]:
+        cell = folder / CELLS_FOLDER / entry["cell"]
         if not (cell / RESULT_FILE).is_file():
-            sources.missing.append(f"Cell {name} of the study {folder} is not finished.")
+            sources.missing.append(f"Cell {cell.name} of the study {folder} is not finished.")
             continue
-        asked = _read_json(cell / CELL_FILE)
-        if split not in (None, asked["split"]):
-            sources.missing.append(f"Cell {name} of the study {folder} was evaluated on {asked['split']}.")
+        played = _read_json(cell / CELL_FILE)["split"]
+        if split not in (None, played):
+            sources.missing.append(f"Cell {cell.name} of the study {folder} was evaluated on {played}, not on {split}.")
             continue
-        label = _cell_label(asked)
-        sources.results.append(_named(load_evaluation(cell / EVALUATION_FOLDER), label))
-        if asked["training"] is not None:
-            sources.runs.append(read_training_run(cell / RUN_FOLDER, _curve_label(label, asked["heuristic"])))
+        _add_cell(sources, cell, None)
         taken += 1
     if not taken:
         wanted = "finished cell" if split is None else f"finished cell that was evaluated on {split}"
         raise UsageError(f"The study {folder} has no {wanted} yet: 'rl2grid study status' says how far it is.")
+
+
+def _add_cell(sources: Sources, folder: Path, given: str | None) -> None:
+    """One cell of a study: under the label given, else under that of its group."""
+    cell = _read_json(folder / CELL_FILE)
+    label = given or _cell_label(cell)
+    sources.results.append(_named(load_evaluation(folder / EVALUATION_FOLDER), label))
+    if cell["training"] is not None:
+        curve = label if given or not label or not cell["heuristic"] else f"{label} + {cell['heuristic']}"
+        sources.runs.append(read_training_run(folder / RUN_FOLDER, curve))
 
 
 def _cell_label(cell: Mapping[str, Any]) -> str | None:
@@ -139,10 +147,6 @@ def _cell_label(cell: Mapping[str, Any]) -> str | None:
     after = "" if training is None else f"-{training['seed']}"
     label = cell["name"].removeprefix(before).removesuffix(after).strip("-")
     return f"{cell['agent']} {label}" if label else None
-
-
-def _curve_label(label: str | None, heuristic: str | None) -> str | None:
-    return f"{label} + {heuristic}" if label and heuristic else label
 
 
 def _named(result: EvaluationResult, label: str | None) -> EvaluationResult:

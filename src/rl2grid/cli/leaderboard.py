@@ -75,7 +75,8 @@ def _entry(options: argparse.Namespace) -> int:
     write_entry(options.output, entry)
     decisions = sum(len(episode.actions) for episode in entry.episodes)
     size = options.output.stat().st_size
-    print(f"{len(entry.episodes)} episodes with {decisions:,} actions, as evaluated.")
+    episodes = len(entry.episodes)
+    print(f"{episodes} of {episodes} episodes played as in the evaluation, with {decisions:,} actions.")
     print(f"Written: {options.output} ({size / 1000:,.0f} kB).")
     return 0
 
@@ -94,8 +95,10 @@ def _verify(options: argparse.Namespace) -> int:
             different += 1
             print(f"rl2grid: {path} is not verified: {difference}.", file=sys.stderr)
         else:
-            survival = entry.result.summary.survival.value
-            print(f"{path} is verified: {len(entry.episodes)} episodes, survival {survival:.3f}, exactly as stored.")
+            survival, episodes = entry.result.summary.survival.value, len(entry.episodes)
+            print(
+                f"{path} is verified: survival {survival:.3f} in {episodes} of {episodes} episodes, exactly as stored."
+            )
     return DIFFERENT if different else 0
 
 

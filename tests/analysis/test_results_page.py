@@ -1,0 +1,105 @@
+"""The page of all results: that it holds everything, says what made it, and keeps to its size."""
+
+from __future__ import annotations
+
+import html
+import re
+from pathlib import Path
+
+import pytest
+from sample_results import TASK, curve, result
+from test_report import Page
+
+from rl2grid.analysis import results_page, section
+from rl2grid.analysis.results_page import write_results_page
+from rl2grid.analysis.sources import Sources
+from rl2grid.analysis.training import TrainingRun
+from rl2grid.errors import UsageError
+
+RUN = TrainingRun(Path("runs/one"), TASK, {}, 1, curve())
+RESULTS = [
+    result("ppo", [[1.0], [0.9], [1.0]], "idle", agent_hash="a"),
+    result("do-<b>nothing", [[0.2], [0.1], [0.4]]),
+    result("ppo", [[0.8], [0.7], [0.6]], "idle", agent_hash="b"),
+]
+
+
+@pytest.fixture(autouse=True)
+def _few_figures(monkeypatch):
+    chosen = section.evaluation_pictures
+    names = ("levels", "months")
+    monkeypatch.setattr(
+        section, "evaluation_pictures", lambda methods: [p for p in chosen(methods) if p.name.startswith(names)]
+    )
+
+
+def write(folder: Path, sources: Sources, **changes) -> str:
+    keywords = {
+        "title": "A <b>title</b>",
+        "command": "rl2grid report x",
+        "train_commands": {RUN.folder: "rl2grid train"},
+    }
+    size = write_results_page(folder / "report.html", sources, **{**keywords, **changes})
+    text = (folder / "report.html").read_text(encoding="utf-8")
+    assert size == len(text.encode())
+    assert [path.name for path in folder.iterdir()] == ["report.html"]
+    return text
+
+
+def test_the_page_is_whole_and_needs_nothing_else(tmp_path):
+    told: list[str] = []
+    text = write(tmp_path, Sources(RESULTS, [RUN], ["Something is not there."]), on_figure=told.append)
+    parser = Page()
+    parser.VOID = (*Page.VOID, "input")
+    parser.feed(text)
+    assert parser.open == []
+    assert len(told) == results_page.number_of_figures(Sources(RESULTS, [RUN])) > 1
+    sources = [address for address in parser.fetched if not address.startswith("#")]
+    assert len(sources) == 2 * len(told)
+    assert all(address.startswith("data:image/png;base64,") for address in sources)
+    assert "http" not in re.sub(r"base64,[^']*", "", text)
+    places = {address[1:] for address in parser.fetched if address.startswith("#")}
+    assert places <= set(re.findall(r"id='?([\w.-]+)", text))
+    for words in ("A &lt;b&gt;title", "Something is not there.", "do-&lt;b&gt;nothing", "0.850"):
+        assert words in text
+    for command in (
+        "rl2grid report x",
+        "rl2grid train",
+        "rl2grid evaluate ppo",
+        "rl2grid evaluate do-&lt;b&gt;nothing",
+    ):
+        assert f"<code>{command}</code>" in text
+    for table in section.plan_section(RESULTS, [RUN]).tables:
+        assert html.escape(table.caption) in text
+
+
+def test_the_ranking_leads_from_methods_to_their_commands(tmp_path):
+    text = write(tmp_path, Sources(RESULTS))
+    ranking = text[text.index("id=ranking") : text.index("id=tables")]
+    first, second = re.findall(r"<tbody>(.*)</tbody>", ranking)[0].split("</tr>")[:2]
+    assert "ppo + idle" in first
+    assert re.findall(r"href='#(\w+)'", first) == ["e1", "e3"]
+    assert re.findall(r"href='#(\w+)'", second) == ["e2"]
+
+
+def test_runs_alone_make_a_page(tmp_path):
+    text = write(tmp_path, Sources(runs=[RUN]))
+    assert "id=ranking" not in text
+    assert "id=episodes" not in text
+    assert "rl2grid train" in text
+
+
+def test_figures_shrink_until_the_page_fits(tmp_path):
+    whole = len(write(tmp_path, Sources(RESULTS, [RUN])).encode())
+    limit = whole // 2
+    assert len(write(tmp_path, Sources(RESULTS, [RUN]), max_bytes=limit).encode()) <= limit
+    # A limit that cannot be kept is no reason to lose the figures.
+    assert write(tmp_path, Sources(RESULTS, [RUN]), max_bytes=1).count("<figure>") > 1
+
+
+def test_results_that_do_not_belong_together_make_no_page(tmp_path):
+    with pytest.raises(UsageError, match="different engine"):
+        write(tmp_path, Sources([RESULTS[0], result("other", [[1.0], [1.0], [1.0]], engine="another")]))
+    with pytest.raises(UsageError, match="nothing to analyse"):
+        write(tmp_path, Sources())
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,90 @@
+"""``rl2grid leaderboard``: writing, verifying and ranking entries."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from rl2grid.analysis.entries import FACTS, episode_hash
+from rl2grid.cli.main import main
+from rl2grid.experiments.evaluation import evaluate
+
+MONTH = "generated/700000-00"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two evaluations of a month, one of their entries with a forged survival."""
+    folder = tmp_path_factory.mktemp("entries")
+    for agent in ("do-nothing", "random"):
+        evaluate(agent, "bus14-T0", scenarios=[MONTH], heuristic="idle", output=folder / agent)
+        assert main(["leaderboard", "entry", str(folder / agent), "--output", str(folder / f"{agent}.json")]) == 0
+    contents = json.loads((folder / "random.json").read_text())
+    (episode,) = contents["episodes"]
+    episode["survival"] = 0.999
+    episode["hash"] = episode_hash({name: episode[name] for name in FACTS})
+    (folder / "forged.json").write_text(json.dumps(contents))
+    return folder
+
+
+def test_an_entry_says_how_large_it_is(folder, capsys):
+    words = ["leaderboard", "entry", str(folder / "random"), "--output", str(folder / "dice.json"), "--label", "dice"]
+    assert main(words) == 0
+    output = capsys.readouterr().out
+    assert "1 of 1 episodes played as in the evaluation" in output
+    assert f"Written: {folder / 'dice.json'} (" in output
+    assert not list(folder.glob("*.tmp"))
+
+
+def test_honest_entries_are_verified(folder, capsys):
+    assert main(["leaderboard", "verify", str(folder / "random.json"), str(folder / "do-nothing.json")]) == 0
+    output = capsys.readouterr().out
+    assert f"{folder / 'random.json'} is verified: survival 0." in output
+    assert output.count("exactly as stored") == 2
+
+
+def test_a_forged_entry_is_named_and_the_others_go_on(folder, capsys):
+    assert main(["leaderboard", "verify", str(folder / "forged.json"), str(folder / "random.json")]) == 1
+    captured = capsys.readouterr()
+    (sentence,) = captured.err.strip().splitlines()
+    assert f"{folder / 'forged.json'} is not verified: Episode {MONTH}, seed 0 differs" in sentence
+    assert "survival is stored as 0.999" in sentence
+    assert f"{folder / 'random.json'} is verified" in captured.out
+
+
+def test_entries_are_ranked_by_survival(folder, capsys, monkeypatch):
+    monkeypatch.chdir(folder)
+    files = [f"{name}.json" for name in ("do-nothing", "forged", "random")]
+    assert main(["leaderboard", "table", *files]) == 0
+    output = capsys.readouterr().out
+    assert "bus14-T0-v0" in output
+    survivals = [float(line.partition("[")[0].split()[-1]) for line in output.splitlines() if ".json" in line]
+    assert len(survivals) == 3
+    assert survivals == sorted(survivals, reverse=True)
+    assert survivals[0] == 0.999
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        (["entry", "{}", "--output", "{}/x.json"], "holds no evaluation on validation"),
+        (["entry", "{}/random", "--output", "{}/nowhere/x.json"], "of the output does not exist"),
+        (["entry", "{}/random"], "--output"),
+        (["verify", "{}/missing.json"], "cannot be read as an entry"),
+        (["verify", "{}/random.json", "{}/random/evaluation.json"], "is no entry of a leaderboard"),
+        (["table", "{}/random.json", "{}/random.json"], "was given twice"),
+        (["table", "{}/random.json", "{}/two.json"], "different scenarios or seeds"),
+    ],
+)
+def test_refusals_are_one_sentence(folder, tmp_path, capsys, words, part):
+    if "{}/two.json" in words:
+        evaluate("random", "bus14-T0", scenarios=[MONTH], seeds=[0, 1], heuristic="idle", output=tmp_path / "two")
+        main(["leaderboard", "entry", str(tmp_path / "two"), "--output", str(folder / "two.json")])
+    capsys.readouterr()
+    assert main(["leaderboard", *(word.format(folder) for word in words)]) == 2
+    captured = capsys.readouterr()
+    (sentence,) = captured.err.strip().splitlines()
+    assert part in sentence
+    assert "verified" not in captured.out
