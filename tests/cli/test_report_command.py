@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
-from test_sources import CELLS, write_made_up_evaluation, write_made_up_run, write_made_up_study
+from sample_folders import CELLS, write_made_up_evaluation, write_made_up_run, write_made_up_study
 
 from rl2grid.cli.main import main
 
