@@ -88,13 +88,16 @@ def _ranking_table(
     limit = ranked[0].task.constraint
     limits = (limit,) if limit else tuple(THRESHOLDS)
     headings = ("Survival", "Completed", *(f"Safe {name}" for name in limits), "Runs", "Scenarios", "Seeds", "Episodes")
+    survivals = [estimate(method.scores("survival")) for method in ranked]
+    best = _printed_best([survival.value for survival in survivals], 3)
     rows = []
-    for place, (name, method) in enumerate(zip(names, ranked, strict=True)):
-        survival = method.scores("survival")
+    for name, method, survival in zip(names, ranked, survivals, strict=True):
         shares = (method.scores("completed"), *(method.safe(name) for name in limits))
-        first = interval_cell(estimate(survival), best=place == 0 and len(ranked) > 1)
-        cells = (first, *(share_cell(estimate(scores)) for scores in shares))
-        counts = [str(number) for number in (*survival.values.shape, len(method.episodes))]
+        cells = (
+            interval_cell(survival, best=round(survival.value, 3) == best),
+            *(share_cell(estimate(scores)) for scores in shares),
+        )
+        counts = [str(number) for number in (*method.scores("survival").values.shape, len(method.episodes))]
         if not method.is_trained:
             counts[0] = MISSING.text
         rows.append((*name, *cells, *(Cell(text) for text in counts)))
