@@ -36,10 +36,11 @@ class Visit:
 def visiting(path: Path, size: tuple[int, int], scheme: str = "light") -> Iterator[Visit]:
     """Open a page of this machine; the test is skipped where no browser is found."""
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: rl2grid[browser]")
-    found = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if found is None:
-        pytest.skip(f"no headless browser is installed: none of {', '.join(BROWSERS)} is on the path")
     with playwright.sync_playwright() as library:
+        own = library.chromium.executable_path
+        found = next(filter(None, map(shutil.which, (own, *BROWSERS))), None)
+        if found is None:
+            pytest.skip(f"no browser is installed: none of {', '.join(BROWSERS)} is on the path")
         # Without a sandbox of its own: tests may run as root, and open nothing but files that they wrote.
         browser = library.chromium.launch(executable_path=found, args=["--no-sandbox"])
         page = browser.new_page(viewport={"width": size[0], "height": size[1]}, color_scheme=scheme)

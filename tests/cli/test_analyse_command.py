@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
+from sample_folders import CELLS, write_made_up_study
 
 from rl2grid.cli.main import main
 from rl2grid.experiments.evaluation import evaluate
@@ -43,6 +44,17 @@ def test_evaluations_below_a_folder_are_those_of_the_split(folder, capsys, monke
     assert main(analyse(folder, str(folder / "agent"))) == 0
     assert "5 tables" in capsys.readouterr().out
     assert main([*analyse(folder, str(folder / "agent")), "--split", "train"]) == 2
+
+
+def test_a_study_is_a_folder_like_others(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("rl2grid.analysis.section.evaluation_pictures", lambda methods: [])
+    monkeypatch.setattr("rl2grid.analysis.section.training_pictures", lambda curves: [])
+    unfinished = {**CELLS[1], "finished": False}
+    write_made_up_study(tmp_path / "study", [dict(CELLS[0]), unfinished, dict(CELLS[3])])
+    assert main(analyse(tmp_path, str(tmp_path / "study"))) == 0
+    output = capsys.readouterr().out
+    assert f"Cell {CELLS[1]['name']} of the study" in output
+    assert "6 tables" in output
 
 
 @pytest.mark.parametrize(

@@ -64,6 +64,7 @@ def test_tasks_of_one_grid(capsys):
         (["evaluate", "do-nothing", "bus99-T0"], "with a grid of bus14"),
         (["evaluate", "do-nothing", "bus14-T0", "--split", "dev"], "choose from 'train', 'validation'"),
         (["evaluate", "do-nothing", "bus14-T0", "--seeds", "0"], "seeds"),
+        (["evaluate", "do-nothing", "bus14-T0", "--months", "0"], "months=0 is not allowed"),
         (["evaluate", "do-nothing", "bus14-T0", "--engine", "fast"], "choose from 'native', 'reference'"),
         (["evaluate", "do-nothing", "bus14-T0", "--constraint", "N-1"], "choose from 'None', 'LSI', 'TLO'"),
         (["evaluate", "do-nothing", "bus14-T0-LSI", "--constraint", "TLO"], "contradicts task"),

@@ -177,6 +177,7 @@ def test_failures_are_tried_again_refusals_are_not_and_the_others_go_on(tmp_path
     assert stored["cells"][0]["commands"][0].startswith(
         "rl2grid train ppo rl2grid/bus14-T0-v0 --preset default --seed 1"
     )
+    assert stored["cells"][0]["commands"][1].endswith("--split test --seeds 1 --months 2 --heuristic None")
 
 
 WAITING_CELL = """
