@@ -151,6 +151,8 @@ def _parse(path: Path, contents: Mapping[str, Any]) -> Entry:
     identity = dict(contents["identity"])
     if identity_hash(identity) != contents["identity_hash"]:
         raise UsageError(f"{path} was changed: its identity does not have the hash {contents['identity_hash']!r}.")
+    if not isinstance(identity["versions"], dict):
+        raise ValueError(f"versions are {identity['versions']!r}")
     episodes = tuple(_episode(path, stored) for stored in contents["episodes"])
     if not episodes:
         raise UsageError(f"{path} is an entry without episodes.")

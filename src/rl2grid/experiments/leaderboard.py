@@ -37,6 +37,7 @@ from rl2grid.experiments.agents import AGENTS, make_agent
 from rl2grid.experiments.energy import ENERGY_FILE
 from rl2grid.experiments.episode import PlayedEpisode, play_episode
 from rl2grid.experiments.evaluation import question
+from rl2grid.mdp.rewards import resolve_reward
 from rl2grid.scenarios.library import check_in_split
 from rl2grid.versions import library_versions
 
@@ -263,7 +264,11 @@ def _keywords(identity: Mapping[str, Any], name: str) -> dict[str, Any]:
     keywords["reward"] = tuple(reward) if isinstance(reward, list) else reward
     if isinstance(reward, str) and "." in reward:
         raise UsageError(f"{name} cannot be played: its reward is the function {reward}, which no file can hold.")
-    TaskOptions(**keywords)
+    try:
+        TaskOptions(**keywords)
+        resolve_reward(keywords["reward"])
+    except (UsageError, TypeError, ValueError) as error:
+        raise UsageError(f"{name} cannot be played: {error}") from None
     return keywords
 
 
