@@ -42,6 +42,13 @@ def test_columns_with_one_value_alone_are_left_out_where_they_often_are():
     assert "split" in [one["name"] for one in explorer_data([*RESULTS, other], ["e1", "e2", "e3"])["columns"]]
 
 
+def test_the_seed_of_the_training_is_shown_where_there_are_several():
+    trained = [result("ppo", [[0.5]], agent_identity={"trained_with": {"seed": seed}}) for seed in (1, 2)]
+    assert column(explorer_data([*trained, RESULTS[1]], ["e1", "e2", "e3"]), "training") == ["1", "2", "", ""]
+    names = [one["name"] for one in explorer_data([trained[0]], ["e1"])["columns"]]
+    assert "training" not in names
+
+
 def test_rows_are_a_few_bytes_each():
     many = [result("ppo", [[k / 7919] * 10 for k in range(300)])]
     assert len(json.dumps(explorer_data(many, ["e1"]), separators=(",", ":"))) < 100 * 3000

@@ -80,6 +80,10 @@ def test_the_table_of_episodes_sorts_and_filters(report):
         page.locator("#search").fill("survival<0.5 seed=3")
         assert set(column("seed")) == {"3"}
         assert all(float(text) < 0.5 for text in column("survival"))
+        page.locator("#search").fill("made=e2 scenario=scenario")
+        assert page.locator("#shown").inner_text().startswith("0 of 3,000 episodes")
+        page.locator("#search").fill("made=e2")
+        assert page.locator("#shown").inner_text().startswith("1,500 of 3,000 episodes")
         page.locator("#search").fill("nothing of the kind")
         assert page.locator("#shown").inner_text().startswith("0 of 3,000 episodes")
         assert visit.errors == []

@@ -18,12 +18,10 @@
 
   // Everything below works on numbers of rows, never on elements: a page of the table has few of those.
   function matcher(term) {
-    const parts = /^(\w+)(<=|>=|<|>|=)(-?\d*\.?\d+)$/.exec(term);
-    const column = parts && columns.get(parts[1]);
-    if (column && column.numbers) {
-      const compare = comparisons[parts[2]], limit = Number(parts[3]);
-      return (row) => compare(column.numbers[row], limit);
-    }
+    const [, name, sign, value] = /^(\w+)(<=|>=|<|>|=)(.+)$/.exec(term) || [];
+    const column = columns.get(name), compare = comparisons[sign], limit = Number(value);
+    if (column && column.numbers && !Number.isNaN(limit)) return (row) => compare(column.numbers[row], limit);
+    if (column && column.words && sign === "=") return (row) => column.lower[column.places[row]] === value;
     const hits = data.columns.filter((each) => each.words).map((each) => {
       const found = each.lower.map((word) => word.includes(term));
       return (row) => found[each.places[row]];

@@ -56,6 +56,8 @@ _COLUMNS = (
 )
 _OFTEN_EQUAL = ("start", "split", "engine")
 """Columns that are left out when all episodes have the same in them."""
+_BEFORE_TRAINING = [column.name for column in _COLUMNS].index("seed") + 1
+_TRAINING = {"name": "training", "heading": "Training seed"}
 _MADE_BY = {"name": "made", "heading": "Made by"}
 
 
@@ -78,8 +80,17 @@ def explorer_data(results: Sequence[EvaluationResult], made_by: Sequence[str]) -
     values = {column: [column.value(episode) for episode in episodes] for column in _COLUMNS}
     shown = [column for column in _COLUMNS if column.name not in _OFTEN_EQUAL or len(set(values[column])) > 1]
     columns = [_column_data(column, values[column]) for column in shown]
+    trained = [_training_seed(result) for result in results for _ in result.episodes]
+    if len(set(trained)) > 1:
+        columns.insert(_BEFORE_TRAINING, {**_TRAINING, **_words(trained)})
     places = [place for place, result in zip(made_by, results, strict=True) for _ in result.episodes]
     return {"rows": len(episodes), "columns": [*columns, {**_MADE_BY, **_words(places)}]}
+
+
+def _training_seed(result: EvaluationResult) -> str:
+    """Empty for agents without training."""
+    agent = result.identity.get("agent_identity") or {}
+    return str(agent.get("trained_with", {}).get("seed", ""))
 
 
 def _column_data(column: _Column, values: Sequence[str | float]) -> dict[str, Any]:
