@@ -1,4 +1,5 @@
-# Everything runs in a virtual environment of its own, made on first use.
+# Everything runs in a virtual environment of its own, made on first use. Only what is imported is byte-compiled, when it
+# is: to compile all libraries takes longer than to copy them.
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
@@ -21,13 +22,13 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	@echo "== Creating the virtual environment $(VENV) and installing rl2grid (one to three minutes)"
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "rl2grid needs Python 3.11 or newer: set PYTHON=/path/to/python3.11."; exit 1; }
 	@$(PYTHON) -m venv $(VENV)
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --progress-bar on --constraint constraints.txt --editable ".[train,analysis,docs,dev]"
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --progress-bar on --no-compile --constraint constraints.txt --editable ".[train,analysis,docs,dev]"
 	@touch $@
 
 # RLlib and TorchRL are large, and a browser is driven by the longer tests alone.
 $(VENV)/.installed-examples: $(VENV)/.installed
 	@echo "== Installing the libraries of the examples and of the tests in a browser (about a minute)"
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --progress-bar on --constraint constraints.txt --editable ".[examples,browser]"
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --progress-bar on --no-compile --constraint constraints.txt --editable ".[examples,browser]"
 	@touch $@
 
 demo: $(VENV)/.installed
