@@ -514,6 +514,15 @@ def contents(one: Any, kind: str) -> dict[str, Any]:
     }
 
 
+def test_a_policy_of_another_version_is_refused(tmp_path: Path):
+    one = trainer("dqn")
+    stored = contents(one, "dqn")
+    del stored["policy"]["networks"]
+    save_checkpoint(tmp_path / "best.pt", stored)
+    with pytest.raises(UsageError, match="lacks 'networks': another version of rl2grid wrote it"):
+        load_agent(tmp_path)
+
+
 def _expected(kind: str, one: Any) -> Callable[[torch.Tensor, torch.Tensor], Any]:
     """The deterministic policy, said differently."""
 

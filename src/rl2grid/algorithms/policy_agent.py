@@ -127,14 +127,18 @@ def load_agent(
         name: What tables call the agent; by default the name of the algorithm.
 
     Raises:
-        UsageError: no checkpoint there, or one of another task.
+        UsageError: no checkpoint there, or one of another task or another version of rl2grid.
     """
     path = Path(path)
     if path.is_dir():
         best = path / BEST_FILE
         path = best if best.is_file() else path / CHECKPOINT_FILE
     task = None if task_id is None else find_task(task_id).id
-    return PolicyAgent(load_checkpoint(path, task=task), deterministic=deterministic, name=name)
+    contents = load_checkpoint(path, task=task)
+    try:
+        return PolicyAgent(contents, deterministic=deterministic, name=name)
+    except KeyError as error:
+        raise UsageError(f"Checkpoint {str(path)!r} lacks {error}: another version of rl2grid wrote it.") from error
 
 
 def _hash(network: torch.nn.Module) -> str:
