@@ -67,7 +67,7 @@ def test_commands_exist_with_their_flags(block, line, monkeypatch):
     options = command_line.make_parser().parse_args(arguments)
     if hasattr(options, "task"):
         find_task(options.task)
-    if hasattr(options, "agent"):
+    if getattr(options, "agent", None) is not None:
         assert options.agent in AGENTS or options.agent.startswith("runs/")
 
 
