@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,6 +9,7 @@ from rl2grid.agents.agent import Action, Info, Observation
 from rl2grid.agents.dc_flow import buses, dc_point, sensitivities
 from rl2grid.agents.dispatch import (
     Control,
+    DispatchAgent,
     anything_dispatched,
     control_positions,
     controls,
@@ -19,12 +17,8 @@ from rl2grid.agents.dispatch import (
     worst_loading,
 )
 from rl2grid.agents.linear_programme import F64, Affine, Programme
-from rl2grid.errors import UsageError
-from rl2grid.grids import Grid
-from rl2grid.mdp.actions import continuous_layout
 from rl2grid.mdp.heuristics import is_safe
 from rl2grid.mdp.state import GridState
-from rl2grid.powerflow.model import load_network
 
 _MARGIN = 0.9
 """Share of a line's limit up to which it may be loaded."""
@@ -36,7 +30,7 @@ _WORTHWHILE = 1e-3
 """Least decrease of the worst loading for which an action is played."""
 
 
-class DcOpf:
+class DcOpf(DispatchAgent):
     """Redispatches, curtails and stores so that no line is loaded above 90%, at the least cost.
 
     A linear programme on the DC approximation, solved at every decision in which the grid is not safe or something is
@@ -46,25 +40,10 @@ class DcOpf:
 
     name = "dc-opf"
 
-    def bind(self, env: gymnasium.Env[Any, Any]) -> None:
-        """Look up the electrical model of the grid.
-
-        Raises:
-            UsageError: the task has no continuous actions.
-        """
-        if not isinstance(env.action_space, gymnasium.spaces.Box):
-            raise UsageError(
-                "Agent 'dc-opf' cannot play a topology task (-T0-, -T1-, ...), which has no redispatch: "
-                "choose a redispatching task (-R-) or the agent 'milp'."
-            )
-        base: Any = env.unwrapped
-        self._env = base
-        self._grid: Grid = base.grid
-        self._network = load_network(self._grid)
-        self._nothing = np.zeros(continuous_layout(self._grid).size, np.float32)
-
-    def reset(self, i: int) -> None:
-        """Nothing to forget."""
+    refusal = (
+        "Agent 'dc-opf' cannot play a topology task (-T0-, -T1-, ...), which has no redispatch: "
+        "choose a redispatching task (-R-) or the agent 'milp'."
+    )
 
     def act(self, observation: Observation, info: Info) -> Action:
         """The action that the programme asks for, if the forecast confirms it; zeros otherwise."""

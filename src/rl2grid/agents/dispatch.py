@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
+import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from rl2grid.errors import UsageError
 from rl2grid.grids import STEPS_PER_HOUR, Grid
 from rl2grid.mdp.actions import continuous_layout
 from rl2grid.mdp.state import GridState
+from rl2grid.powerflow.model import load_network
 
 F64 = NDArray[np.float64]
 _CURTAILMENT_PRICE = 10.0
@@ -28,6 +31,30 @@ class Control(NamedTuple):
     most: F64  # [control] MW
     at_rest: F64  # [control] MW at which it costs nothing
     price: F64  # [control] per MW away from rest
+
+
+class DispatchAgent:
+    """What agents that plan redispatch on the DC flow have in common: the grid and its electrical model."""
+
+    refusal: ClassVar[str]
+    """What is said of tasks without continuous actions."""
+
+    def bind(self, env: gymnasium.Env[Any, Any]) -> None:
+        """Look up the electrical model of the grid.
+
+        Raises:
+            UsageError: the task has no continuous actions.
+        """
+        if not isinstance(env.action_space, gymnasium.spaces.Box):
+            raise UsageError(self.refusal)
+        base: Any = env.unwrapped
+        self._env = base
+        self._grid: Grid = base.grid
+        self._network = load_network(self._grid)
+        self._nothing = np.zeros(continuous_layout(self._grid).size, np.float32)
+
+    def reset(self, i: int) -> None:
+        """Nothing to forget."""
 
 
 def controls(state: GridState, grid: Grid) -> Control:

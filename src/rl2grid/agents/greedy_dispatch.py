@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,18 +12,16 @@ from rl2grid.agents.dc_flow import buses, dc_point, sensitivities
 from rl2grid.agents.dispatch import (
     F64,
     Control,
+    DispatchAgent,
     anything_dispatched,
     control_positions,
     controls,
     encode,
     worst_loading,
 )
-from rl2grid.errors import UsageError
-from rl2grid.grids import Grid
 from rl2grid.mdp.actions import continuous_layout
 from rl2grid.mdp.heuristics import is_safe
 from rl2grid.mdp.state import GridState
-from rl2grid.powerflow.model import load_network
 
 I64 = NDArray[np.int64]
 
@@ -56,7 +53,7 @@ class Shifts(NamedTuple):
     power: F64  # [shift] MW
 
 
-class GreedyDispatch:
+class GreedyDispatch(DispatchAgent):
     """Shifts power between generators, renewables and storage so that the worst loading of the forecast is least.
 
     While the grid is not safe, all shifts between two controls by half and all of their room are ranked by a DC flow;
@@ -66,22 +63,7 @@ class GreedyDispatch:
 
     name = "greedy"
 
-    def bind(self, env: gymnasium.Env[Any, Any]) -> None:
-        """Look up the electrical model of the grid.
-
-        Raises:
-            UsageError: the task has no continuous actions.
-        """
-        if not isinstance(env.action_space, gymnasium.spaces.Box):
-            raise UsageError("A dispatch cannot be searched for on a topology task: choose a redispatching task (-R-).")
-        base: Any = env.unwrapped
-        self._env = base
-        self._grid: Grid = base.grid
-        self._network = load_network(self._grid)
-        self._nothing = np.zeros(continuous_layout(self._grid).size, np.float32)
-
-    def reset(self, i: int) -> None:
-        """Nothing to forget."""
+    refusal = "A dispatch cannot be searched for on a topology task: choose a redispatching task (-R-)."
 
     def act(self, observation: Observation, info: Info) -> Action:
         """The action with the least worst loading on the forecast; zeros where none is better."""
