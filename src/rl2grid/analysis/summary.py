@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rl2grid.analysis.episodes import Episode
 from rl2grid.analysis.statistics import (
@@ -88,8 +89,8 @@ def summarise(episodes: Sequence[Episode]) -> Summary:
         episode_return=of("episode_return"),
         cost_lsi=of("cost_lsi"),
         cost_tlo=of("cost_tlo"),
-        safe_lsi=_safe(episodes, "cost_lsi", THRESHOLDS["LSI"]),
-        safe_tlo=_safe(episodes, "cost_tlo", THRESHOLDS["TLO"]),
+        safe_lsi=_estimate(safe_episodes(episodes, {"LSI": THRESHOLDS["LSI"]}), mean),
+        safe_tlo=_estimate(safe_episodes(episodes, {"TLO": THRESHOLDS["TLO"]}), mean),
         score_margin=of("score_margin"),
         score_overload=of("score_overload"),
         score_topology=of("score_topology"),
@@ -116,9 +117,20 @@ def by_scenario(episodes: Sequence[Episode], column: str) -> Floats:
     return values.reshape(n_scenarios, n_seeds)
 
 
-def _safe(episodes: Sequence[Episode], column: str, threshold: float) -> Estimate:
-    costs, completed = by_scenario(episodes, column), by_scenario(episodes, "completed")
-    return _estimate(((costs <= threshold) & (completed == 1)).astype(np.float64), mean)
+def safe_episodes(episodes: Sequence[Episode], limits: Mapping[str, float]) -> Floats:
+    """Whether episodes were completed within all limits, 0 or 1, float64 [scenario, seed]: dying early is not safety.
+
+    Args:
+        episodes: of one agent on one task.
+        limits: largest cost by constraint (``"LSI"``, ``"TLO"``).
+
+    Raises:
+        ValueError: some scenario was not played with every seed.
+    """
+    safe: NDArray[np.bool_] = by_scenario(episodes, "completed") == 1
+    for constraint, limit in limits.items():
+        safe &= by_scenario(episodes, f"cost_{constraint.lower()}") <= limit
+    return safe.astype(np.float64)
 
 
 def _estimate(values: Floats, statistic: Statistic) -> Estimate:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 from rl2grid.algorithms.policy_agent import PolicyAgent
-from rl2grid.analysis.episodes import Episode
+from rl2grid.analysis.summary import safe_episodes
 from rl2grid.experiments import runs
 from rl2grid.experiments.evaluation import evaluate
 
@@ -42,15 +42,6 @@ def validator(args: runs.RunArgs, scenarios: Sequence[str] | None = None) -> run
             "cost_tlo": summary.cost_tlo.value,
             "decisions": summary.decisions.value,
         }
-        return {**means, "safe_completed": _share_safe(result.episodes, limits)} if limits else means
+        return {**means, "safe_completed": float(safe_episodes(result.episodes, limits).mean())} if limits else means
 
     return validate
-
-
-def _share_safe(episodes: Sequence[Episode], limits: Mapping[str, float]) -> float:
-    """Share of the episodes that were completed and kept all limits: dying early is not safety."""
-    safe = [
-        episode.completed and all(getattr(episode, f"cost_{name.lower()}") <= limit for name, limit in limits.items())
-        for episode in episodes
-    ]
-    return sum(safe) / len(safe)
