@@ -21,7 +21,7 @@ from rl2grid.algorithms.policy_agent import load_agent
 from rl2grid.analysis.results import EvaluationResult, identity_hash
 from rl2grid.analysis.statistics import Estimate
 from rl2grid.analysis.training import read_training_run, read_validations
-from rl2grid.envs.tasks import find_task
+from rl2grid.envs.tasks import find_task, short_id
 from rl2grid.errors import UsageError
 from rl2grid.experiments.commands import train_command
 from rl2grid.experiments.evaluation import AS_TRAINED, evaluate
@@ -166,7 +166,7 @@ def _cells(entry: Mapping[str, Any]) -> list[str]:
     configuration, training, figures = entry["configuration"], entry["training"], entry["test"]
     survival, low, high = figures["survival"]
     cells = [
-        configuration["task"].removeprefix("rl2grid/").removesuffix("-v0"),
+        short_id(configuration["task"]),
         configuration.get("algorithm") or configuration["agent"],
         _heuristic(configuration) or "none",
         _seed(configuration),

@@ -11,7 +11,7 @@ from sample_results import TASK, curve, result
 from test_report import Page
 
 from rl2grid.analysis import section
-from rl2grid.analysis.results_page import number_of_figures, write_results_page
+from rl2grid.analysis.results_page import write_results_page
 from rl2grid.analysis.sources import Sources
 from rl2grid.analysis.training import TrainingRun
 from rl2grid.errors import UsageError
@@ -53,7 +53,7 @@ def test_the_page_is_whole_and_needs_nothing_else(tmp_path):
     parser.VOID = (*Page.VOID, "input")
     parser.feed(text)
     assert parser.open == []
-    assert len(told) == number_of_figures(Sources(RESULTS, [RUN])) > 1
+    assert len(told) == len(section.plan_section(RESULTS, [RUN]).pictures) > 1
     sources = [address for address in parser.fetched if not address.startswith("#")]
     assert len(sources) == 2 * len(told)
     assert all(address.startswith("data:image/png;base64,") for address in sources)
@@ -94,7 +94,8 @@ def test_figures_shrink_until_the_page_fits(tmp_path):
     limit = len(write(tmp_path, sources).encode()) // 2
     assert len(write(tmp_path, sources, max_bytes=limit).encode()) <= limit
     # A limit that cannot be kept is no reason to lose the figures.
-    assert write(tmp_path, sources, max_bytes=1).count("<figure>") == number_of_figures(sources)
+    pictures = section.plan_section(sources.results, sources.runs).pictures
+    assert write(tmp_path, sources, max_bytes=1).count("<figure>") == len(pictures)
 
 
 def test_results_that_do_not_belong_together_make_no_page(tmp_path):

@@ -11,6 +11,7 @@ from typing import Any
 from rl2grid.analysis.episodes import Episode
 from rl2grid.analysis.methods import method_label
 from rl2grid.analysis.results import EvaluationResult
+from rl2grid.envs.tasks import short_id
 from rl2grid.mdp.termination import GAME_OVER_TEXT, GameOver
 
 DIGITS = 6
@@ -33,7 +34,7 @@ def _ended_by(episode: Episode) -> str:
 
 _COLUMNS = (
     _Column("method", "Method", lambda episode: method_label(episode)),
-    _Column("task", "Task", lambda episode: episode.task.removeprefix("rl2grid/").removesuffix("-v0")),
+    _Column("task", "Task", lambda episode: short_id(episode.task)),
     _Column("scenario", "Scenario", lambda episode: episode.scenario),
     _Column("seed", "Seed", lambda episode: episode.seed),
     _Column("survival", "Survival", lambda episode: episode.survival),

@@ -19,6 +19,7 @@ from rl2grid.analysis.statistics import (
     probability_of_improvement,
 )
 from rl2grid.analysis.tables import MISSING, Cell, Column, ResultTable, interval_cell, mean_cell, share_cell
+from rl2grid.envs.tasks import short_id
 from rl2grid.mdp.constraints import THRESHOLDS
 from rl2grid.mdp.termination import GAME_OVER_TEXT, GameOver
 
@@ -291,7 +292,7 @@ def _names(method: Method) -> tuple[Cell, Cell]:
 
 
 def _task_name(method: Method) -> str:
-    return method.task.id.removeprefix("rl2grid/").removesuffix("-v0")
+    return short_id(method.task.id)
 
 
 def _units(methods: Methods, tasks: Iterable[str]) -> str:

@@ -56,6 +56,7 @@ def write_results_page(
     train_commands: Mapping[Path, str],
     on_figure: Callable[[str], None] = lambda name: None,
     max_bytes: int = MAX_BYTES,
+    plan: Section | None = None,
 ) -> int:
     """Write the page, whole or not at all, and return its size in bytes.
 
@@ -67,11 +68,12 @@ def write_results_page(
         train_commands: what was typed to obtain each run, by its folder.
         on_figure: told the name of every figure before it is drawn.
         max_bytes: what the page may have; the resolution of the figures is lowered until it fits, within reason.
+        plan: of these sources, where :func:`plan_section` made it already; None: it is made.
 
     Raises:
         UsageError: nothing is given, or results or runs that do not belong together; nothing was written.
     """
-    section = plan_section(sources.results, sources.runs)
+    section = plan or plan_section(sources.results, sources.runs)
     methods = group_methods(sources.results) if sources.results else {}
     drawn = [_draw(picture, on_figure) for picture in section.pictures]
     before = [_header(title, sources, methods), *_missing(sources.missing), *_rankings(methods, sources.results)]
@@ -83,15 +85,6 @@ def write_results_page(
     fitting = _fitted(drawn, max(max_bytes - others, 0))
     write_page(path, title, [*before, *_figures(fitting), *after])
     return path.stat().st_size
-
-
-def number_of_figures(sources: Sources) -> int:
-    """How many figures the page will have.
-
-    Raises:
-        UsageError: see :func:`write_results_page`.
-    """
-    return len(plan_section(sources.results, sources.runs).pictures)
 
 
 def _draw(picture: Picture, on_figure: Callable[[str], None]) -> _Drawn:

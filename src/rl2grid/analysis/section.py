@@ -18,14 +18,15 @@ from matplotlib.figure import Figure
 from rl2grid.analysis import comparison_figures as compare
 from rl2grid.analysis import figures
 from rl2grid.analysis.ending_figures import draw_ending_bars, draw_ending_map
+from rl2grid.analysis.files import write_text
 from rl2grid.analysis.methods import Method, group_methods
-from rl2grid.analysis.page import write_text
 from rl2grid.analysis.result_tables import Methods, result_tables
 from rl2grid.analysis.results import EvaluationResult
 from rl2grid.analysis.tables import WRITERS, ResultTable
 from rl2grid.analysis.training import TrainingCurve, TrainingRun, group_curves
 from rl2grid.analysis.training_figures import COST_PANELS, SCORE_PANELS, draw_panels, logs
 from rl2grid.drawing.theme import LIGHT, Theme
+from rl2grid.envs.tasks import short_id
 from rl2grid.errors import UsageError
 
 INDEX_FILE, TABLES_FOLDER, FIGURES_FOLDER = "index.md", "tables", "figures"
@@ -79,6 +80,7 @@ def results_section(
     command: str = "",
     theme: Theme = LIGHT,
     on_file: OnFile = lambda name: None,
+    plan: Section | None = None,
 ) -> Path:
     """Write a results section and return the path of its index.
 
@@ -89,11 +91,12 @@ def results_section(
         command: what was typed to obtain the section.
         theme: colours of the figures.
         on_file: told of every table and figure.
+        plan: of these results and runs, where :func:`plan_section` made it already; None: it is made.
 
     Raises:
         UsageError: nothing is given, or results or runs that do not belong together; nothing was written.
     """
-    section = plan_section(results, runs)
+    section = plan or plan_section(results, runs)
     for name in (TABLES_FOLDER, FIGURES_FOLDER):
         (folder / name).mkdir(parents=True, exist_ok=True)
     for table in section.tables:
@@ -111,7 +114,7 @@ def results_section(
 def training_pictures(curves: CurvesByTask) -> Iterator[Picture]:
     """Figures over training, for every task."""
     for task, group in curves.items():
-        short, runs = _short(task), [run for labelled in group.values() for run in labelled]
+        short, runs = short_id(task), [run for labelled in group.values() for run in labelled]
         yield Picture(
             f"training-{short}",
             f"Survival in training on {short}, mean over {figures.SMOOTHED_EPISODES} episodes; diamonds: validation.",
@@ -138,7 +141,7 @@ def training_pictures(curves: CurvesByTask) -> Iterator[Picture]:
 def evaluation_pictures(methods: Methods) -> Iterator[Picture]:
     """Figures of evaluations: of every task, and of grids that were played on several levels."""
     for task, group in methods.items():
-        for picture in _task_pictures(_short(task), tuple(group)):
+        for picture in _task_pictures(short_id(task), tuple(group)):
             yield replace(picture, task=task)
     for grid, group in _by_grid(methods).items():
         yield _of_methods("levels", grid, group, "Survival on the levels of difficulty of", compare.draw_levels)
@@ -203,10 +206,8 @@ def _index(section: Section, results: Sequence[EvaluationResult], runs: Sequence
         links = ", ".join(f"[{suffix}]({FIGURES_FOLDER}/{picture.name}.{suffix})" for suffix in ("png", "pdf"))
         lines.append(f"- **{picture.name}** ({links}): {picture.caption}")
     lines += ["", "## What they are made from", ""]
-    lines += [f"- {_short(r.episodes[0].task)}, {r.episodes[0].agent}: `{r.command}`" for r in results]
-    lines += [f"- {_short(run.task)}, {run.curve.label}: training run `{run.folder}`, seed {run.seed}" for run in runs]
+    lines += [f"- {short_id(r.episodes[0].task)}, {r.episodes[0].agent}: `{r.command}`" for r in results]
+    lines += [
+        f"- {short_id(run.task)}, {run.curve.label}: training run `{run.folder}`, seed {run.seed}" for run in runs
+    ]
     return "\n".join(lines) + "\n"
-
-
-def _short(task: str) -> str:
-    return task.removeprefix("rl2grid/").removesuffix("-v0")

@@ -51,6 +51,7 @@ def _run(options: argparse.Namespace) -> int:
             command=_command(options),
             theme=themes.DARK if options.theme == "dark" else themes.LIGHT,
             on_file=lambda name: bar.update(task, advance=1, description=name),
+            plan=plan,
         )
     for sentence in sources.missing:
         print(sentence)

@@ -13,6 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from rl2grid.analysis.sources import Sources, load_sources
 from rl2grid.analysis.training import TrainingRun
 from rl2grid.cli.analyse import SPLIT_HELP
+from rl2grid.envs.tasks import short_id
 from rl2grid.errors import UsageError
 from rl2grid.scenarios.splits import SPLITS
 
@@ -37,10 +38,11 @@ def add_parser(commands: Any) -> None:
 def _run(options: argparse.Namespace) -> int:
     sources = load_sources(options.folders, options.split)
     try:
-        from rl2grid.analysis import results_page
+        from rl2grid.analysis import results_page, section
     except ImportError as error:
         raise UsageError(f"Reports need {error.name}: install it with `pip install rl2grid[analysis]`.") from None
-    number = results_page.number_of_figures(sources)
+    plan = section.plan_section(sources.results, sources.runs)
+    number = len(plan.pictures)
     train_commands = _train_commands(sources.runs)
     path = _page_path(options.output)
     with Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), transient=True) as bar:
@@ -52,6 +54,7 @@ def _run(options: argparse.Namespace) -> int:
             command=_command(options),
             train_commands=train_commands,
             on_figure=lambda name: bar.update(task, advance=1, description=name),
+            plan=plan,
         )
     for sentence in sources.missing:
         print(sentence)
@@ -86,7 +89,7 @@ def _title(sources: Sources) -> str:
     )
     if len(tasks) > 3:
         return f"Results on {len(tasks)} tasks"
-    return f"Results on {', '.join(task.removeprefix('rl2grid/').removesuffix('-v0') for task in tasks)}"
+    return f"Results on {', '.join(short_id(task) for task in tasks)}"
 
 
 def _command(options: argparse.Namespace) -> str:

@@ -74,6 +74,11 @@ def find_task(task_id: str) -> Task:
     raise _unknown_task(task_id, name)
 
 
+def short_id(task_id: str) -> str:
+    """What is typed and printed for a task: its id without the namespace and the version."""
+    return task_id.removeprefix("rl2grid/").removesuffix(f"-v{VERSION}")
+
+
 def constraint_of(task: Task, keyword: str | None) -> str | None:
     """The constraint of environments of ``task`` that are made with the keyword ``constraint``.
 

@@ -8,7 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from rl2grid.envs.tasks import TaskOptions
+from rl2grid.envs.tasks import TaskOptions, short_id
 from rl2grid.experiments import runs
 
 WITHOUT_INFLUENCE = frozenset({"torch_threads", "device"})
@@ -22,7 +22,7 @@ def train_command(args: runs.RunArgs, preset: str = "default") -> str:
         args: the run.
         preset: where its hyperparameters came from.
     """
-    words = ["rl2grid", "train", args.algorithm, args.task.removeprefix("rl2grid/").removesuffix("-v0")]
+    words = ["rl2grid", "train", args.algorithm, short_id(args.task)]
     words += ["--preset", preset] if preset != "default" else []
     defaults = asdict(TaskOptions())
     keywords = {name: value for name, value in args.env_keywords.items() if value != defaults[name]}
