@@ -6,9 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from rl2grid.analysis.files import write_json
 from rl2grid.cli.main import main
 from rl2grid.experiments import study_run
-from rl2grid.experiments.study_cell import FINISHED, CellResult, write_json
+from rl2grid.experiments.study_cell import FINISHED, CellResult
 
 STUDY = """
 name = "few"

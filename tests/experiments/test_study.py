@@ -16,11 +16,12 @@ import pandas as pd
 import pytest
 
 import rl2grid
+from rl2grid.analysis.files import write_json
 from rl2grid.errors import UsageError
 from rl2grid.experiments import study_cell, study_run
 from rl2grid.experiments.study import cell_from_dict, cell_to_dict, included_studies, parse_study
 from rl2grid.experiments.study_backends import Local, Slurm
-from rl2grid.experiments.study_cell import BUSY, FAILED, FINISHED, REFUSED, CellResult, prepare, write_json
+from rl2grid.experiments.study_cell import BUSY, FAILED, FINISHED, REFUSED, CellResult, prepare
 from rl2grid.experiments.study_file import read_toml
 from rl2grid.experiments.study_run import MetricsTail, State, read_states, run_study
 from rl2grid.experiments.tuning import Reports, best_command, one_score, parse_tuning, run_tuning
@@ -184,7 +185,8 @@ WAITING_CELL = """
 import sys, time
 from pathlib import Path
 from filelock import FileLock
-from rl2grid.experiments.study_cell import serve, write_json
+from rl2grid.analysis.files import write_json
+from rl2grid.experiments.study_cell import serve
 folder = Path(sys.argv[1])
 def do():
     with FileLock(folder / ".lock").acquire(timeout=0):

@@ -8,9 +8,9 @@ needs, continuous actions as float32.
 from __future__ import annotations
 
 import base64
+import functools
 import hashlib
 import json
-import os
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rl2grid.analysis.episodes import COLUMNS, Episode
+from rl2grid.analysis.files import write_json
 from rl2grid.analysis.results import EvaluationResult, identity_hash
 from rl2grid.errors import UsageError
 
@@ -68,7 +69,7 @@ class Entry:
     """Facts of the training run; None for agents without one."""
     episodes: tuple[PlayedActions, ...]
 
-    @property
+    @functools.cached_property
     def result(self) -> EvaluationResult:
         """The evaluation, as tables take it; the time that episodes took is unknown, 0."""
         identity, agent = self.identity, self.identity["agent_identity"]
@@ -113,9 +114,7 @@ def write_entry(path: Path, entry: Entry) -> None:
         "training": entry.training,
         "episodes": [{**one.facts, "hash": episode_hash(one.facts), **_packed(one.actions)} for one in entry.episodes],
     }
-    temporary = path.with_name(f"{path.name}.tmp")
-    temporary.write_text(json.dumps(contents, indent=1) + "\n", encoding="utf-8")
-    os.replace(temporary, path)
+    write_json(path, contents, indent=1)
 
 
 def read_entry(path: Path) -> Entry:

@@ -6,11 +6,11 @@ import base64
 import html
 import itertools
 import json
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from rl2grid.analysis.files import write_text
 from rl2grid.analysis.results import identity_hash
 from rl2grid.analysis.tables import Cell, ResultTable
 
@@ -114,13 +114,6 @@ def _result_cell(cell: Cell) -> str:
 
 def _data_uri(png: bytes) -> str:
     return f"data:image/png;base64,{base64.b64encode(png).decode()}"
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a file, whole or not at all."""
-    temporary = path.with_name(f"{path.name}.tmp")
-    temporary.write_text(text, encoding="utf-8", newline="\n")
-    os.replace(temporary, path)
 
 
 _PAGE = """<!doctype html>

@@ -17,6 +17,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from rl2grid.analysis import figures, tables
+from rl2grid.analysis.files import write_text
 from rl2grid.analysis.page import (
     cell_html,
     code_html,
@@ -27,7 +28,6 @@ from rl2grid.analysis.page import (
     scrolling,
     table_html,
     write_page,
-    write_text,
 )
 from rl2grid.analysis.recordings import Recording
 from rl2grid.analysis.results import EvaluationResult, check_comparable

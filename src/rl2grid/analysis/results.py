@@ -5,13 +5,13 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from rl2grid.analysis.episodes import EPISODES_FILE, Episode, read_episodes
+from rl2grid.analysis.files import write_json
 from rl2grid.analysis.summary import Summary, summarise
 from rl2grid.errors import UsageError
 
@@ -45,9 +45,7 @@ def identity_hash(identity: Mapping[str, Any]) -> str:
 def write_evaluation(path: Path, request: Mapping[str, Any], summary: Summary | None) -> None:
     """Write the description of an evaluation, with its aggregates once it is complete."""
     record = {**request, "complete": summary is not None, "summary": asdict(summary) if summary else None}
-    temporary = path.with_name(f"{path.name}.tmp")
-    temporary.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
-    os.replace(temporary, path)
+    write_json(path, record)
 
 
 def read_request(path: Path) -> dict[str, Any]:

@@ -12,12 +12,13 @@ after its last checkpoint is missing.
 from __future__ import annotations
 
 import json
-import os
 import resource
 import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+
+from rl2grid.analysis.files import write_json
 
 ENERGY_FILE = "energy.json"
 
@@ -76,9 +77,7 @@ class EnergyAccount:
             "assumptions": _ASSUMPTIONS,
             "parts": parts,
         }
-        temporary = self._path.with_name(self._path.name + ".tmp")
-        temporary.write_text(json.dumps(account, indent=2) + "\n", encoding="utf-8")
-        os.replace(temporary, self._path)
+        write_json(self._path, account)
 
 
 def energy_line(folder: Path) -> str | None:

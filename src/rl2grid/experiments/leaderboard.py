@@ -99,7 +99,7 @@ def make_entry(
                     f"Episode {episode.scenario}, seed {episode.seed} of {evaluation} is played differently now: "
                     f"{difference}{_other_versions(result.identity)}."
                 )
-            played.append(PlayedActions(facts, _as_array(kept, task, env)))
+            played.append(PlayedActions(facts, _as_array(kept, task)))
     on_progress(len(played))
     return Entry(
         label or result.episodes[0].agent,
@@ -248,7 +248,7 @@ def _check_actions(episode: PlayedActions, task: Task, name: str) -> None:
         raise UsageError(f"{name} was changed: actions of the episode {episode.name} are not {allowed}.")
 
 
-def _as_array(kept: list[Action], task: Task, env: gymnasium.Env[Any, Any]) -> Actions:
+def _as_array(kept: list[Action], task: Task) -> Actions:
     if task.kind == "T":
         return np.array(kept, dtype=np.int64).astype(action_dtype(task.n_actions))
     return np.array(kept, dtype="<f4").reshape(len(kept), task.n_actions)

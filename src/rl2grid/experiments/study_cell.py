@@ -30,8 +30,10 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from rl2grid.analysis.episodes import EPISODES_FILE
+from rl2grid.analysis.files import write_json
 from rl2grid.analysis.results import load_evaluation
 from rl2grid.analysis.sources import CELL_FILE, EVALUATION_FOLDER, RESULT_FILE, RUN_FOLDER
+from rl2grid.analysis.training import METRICS_FILE
 from rl2grid.errors import UsageError
 from rl2grid.experiments import runs
 from rl2grid.experiments.commands import flags
@@ -40,7 +42,6 @@ from rl2grid.experiments.study import Cell, Training, cell_from_dict, cell_to_di
 from rl2grid.experiments.validation import validator
 
 LOG_FILE, LOCK_FILE = "log.txt", ".lock"
-METRICS_FILE = "metrics.csv"
 
 FINISHED, FAILED, REFUSED, BUSY, STOPPED = 0, 1, 2, 75, 130
 """Exit statuses. ``REFUSED``: trying again is no use; ``BUSY``: another process has the cell; ``STOPPED``: asked to."""
@@ -266,13 +267,6 @@ def last_error(folder: Path) -> str:
     path = folder / LOG_FILE
     lines = path.read_text(encoding="utf-8", errors="replace").split("\n") if path.exists() else []
     return next((line.strip() for line in reversed(lines) if line.strip()), "it left no message")
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Write a file, whole or not at all."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    temporary.write_text(json.dumps(value, indent=2) + "\n", encoding="utf-8")
-    os.replace(temporary, path)
 
 
 def _read_json(path: Path) -> Any:

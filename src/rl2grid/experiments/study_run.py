@@ -27,15 +27,15 @@ from rich.table import Table
 from rich.text import Text
 
 from rl2grid.analysis.episodes import COLUMNS, EPISODES_FILE, format_row, read_episodes
+from rl2grid.analysis.files import write_json
 from rl2grid.analysis.sources import EVALUATION_FOLDER, RUN_FOLDER, STUDY_FILE
-from rl2grid.analysis.training import VALIDATION
+from rl2grid.analysis.training import METRICS_FILE, VALIDATION
 from rl2grid.experiments.interrupts import stop_requests
 from rl2grid.experiments.study import Cell, Study
 from rl2grid.experiments.study_backends import Backend, Job
 from rl2grid.experiments.study_cell import (
     BUSY,
     FINISHED,
-    METRICS_FILE,
     REFUSED,
     STOPPED,
     CellResult,
@@ -45,7 +45,6 @@ from rl2grid.experiments.study_cell import (
     played_episodes,
     prepare,
     read_result,
-    write_json,
 )
 from rl2grid.versions import library_versions
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 import uuid
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from rl2grid.analysis.files import write_json
 from rl2grid.errors import UsageError
 
 TRACKING_FILE = "wandb.json"
@@ -76,7 +76,5 @@ def _run_id(folder: Path) -> str:
     """The id stored in the run folder; a new one, if there is none yet."""
     path = folder / TRACKING_FILE
     if not path.exists():
-        temporary = path.with_name(path.name + ".tmp")
-        temporary.write_text(json.dumps({"id": uuid.uuid4().hex[:12]}) + "\n", encoding="utf-8")
-        os.replace(temporary, path)
+        write_json(path, {"id": uuid.uuid4().hex[:12]}, indent=None)
     return str(json.loads(path.read_text(encoding="utf-8"))["id"])

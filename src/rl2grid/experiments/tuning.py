@@ -32,6 +32,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from rl2grid.algorithms.policy_agent import PolicyAgent
+from rl2grid.analysis.files import write_json
 from rl2grid.analysis.training import read_validations
 from rl2grid.engines import HEURISTICS
 from rl2grid.envs.tasks import find_task
@@ -41,7 +42,7 @@ from rl2grid.experiments.commands import train_command
 from rl2grid.experiments.evaluation import evenly_spread
 from rl2grid.experiments.interrupts import stop_requests
 from rl2grid.experiments.study import NO_HEURISTIC
-from rl2grid.experiments.study_cell import STOPPED, CellProcess, is_busy, serve, write_json
+from rl2grid.experiments.study_cell import STOPPED, CellProcess, is_busy, serve
 from rl2grid.experiments.study_file import as_table, count, read_toml, refuse_unknown_keys, text, unknown
 from rl2grid.experiments.validation import validator
 
