@@ -9,14 +9,19 @@ from typing import Any
 import pytest
 
 from rl2grid.cli import train as command
+from rl2grid.cli.keywords import NAMES
+from rl2grid.cli.main import main
 from rl2grid.envs.tasks import find_task
+from rl2grid.errors import UsageError
 from rl2grid.experiments import runs
-from rl2grid.experiments.commands import flags, train_command
+from rl2grid.experiments.commands import train_command
+from rl2grid.experiments.flags import evaluate_command, flags
 
 CASES: list[tuple[str, str, str, dict[str, Any], dict[str, Any]]] = [
     ("ppo", "bus14-T0", "default", {}, {}),
     ("ppo", "bus14-T0", "default", {"seed": 3, "num_envs": 4, "actor_layers": (8, 16)}, {"heuristic": "idle"}),
     ("sac", "bus14-R", "paper", {"gamma": 0.95}, {"maintenance": False, "dispatch": "grid2op", "constraint": "TLO"}),
+    ("td3", "bus14-R", "default", {}, {"reward": (1.0, 0.5, 1e-3), "normalize": None, "opponent": False}),
     ("dqn", "bus36-M-T0", "default", {"mask_actions": False, "huber_delta": None}, {"reward": "paper"}),
     ("lagrangian-ppo", "bus14-T0-TLO", "default", {"thresholds": (20.0,), "constraints": ("TLO",)}, {}),
 ]
@@ -32,7 +37,9 @@ def test_a_command_asks_for_the_run_that_it_was_made_from(
     monkeypatch: pytest.MonkeyPatch,
 ):
     chosen = runs.hyperparameters(algorithm, task, preset, **changes)
-    args = runs.RunArgs(find_task(task).id, chosen, algorithm=algorithm, env_keywords=keywords, evaluate_every=700)
+    args = runs.RunArgs(
+        find_task(task).id, chosen, algorithm=algorithm, env_keywords=keywords, evaluate_every=700, validation_months=3
+    )
     asked: list[runs.RunArgs] = []
     monkeypatch.setattr(runs, "train", lambda args, **_: asked.append(args))
     monkeypatch.setattr(command, "_report", lambda *_: 0)
@@ -48,6 +55,34 @@ def test_a_command_asks_for_the_run_that_it_was_made_from(
 def test_what_has_no_influence_on_results_is_left_out():
     args = runs.RunArgs("rl2grid/bus14-T0-v0", runs.hyperparameters("ppo", "bus14-T0", torch_threads=2))
     assert train_command(args) == "rl2grid train ppo bus14-T0"
+
+
+@pytest.mark.parametrize(
+    "keywords",
+    [
+        {},
+        {"heuristic": None},
+        {"heuristic": "idle", "reward": (1.0, 0.5, 0.0), "opponent": False, "maintenance": False},
+        {"engine": "reference", "dispatch": "grid2op", "normalize": None, "constraint": "LSI"},
+    ],
+)
+def test_a_command_asks_for_the_evaluation_that_it_was_made_from(
+    keywords: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+):
+    asked: list[tuple[Any, dict[str, Any]]] = []
+
+    def listen(*arguments: Any, **chosen: Any) -> None:
+        asked.append((arguments, chosen))
+        raise UsageError("heard")
+
+    monkeypatch.setattr("rl2grid.cli.evaluate.evaluate", listen)
+    words = shlex.split(evaluate_command("greedy", "rl2grid/bus14-T0-v0", "test", 3, 2, keywords))
+    assert words[:2] == ["rl2grid", "evaluate"]
+    assert main(words[1:]) == 2
+    (((agent, task), chosen),) = asked
+    assert (agent, task, chosen["split"]) == ("greedy", "rl2grid/bus14-T0-v0", "test")
+    assert (list(chosen["seeds"]), len(chosen["scenarios"])) == ([0, 1, 2], 2)
+    assert {name: value for name, value in chosen.items() if name in ("heuristic", *NAMES)} == keywords
 
 
 def test_flags_of_all_kinds_of_values():

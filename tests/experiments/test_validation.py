@@ -27,7 +27,7 @@ def a_run(task: str, algorithm: str = "ppo", changes: dict[str, Any] | None = No
 def test_the_means_are_those_of_an_evaluation_under_the_conditions_of_training(keywords: dict[str, Any]):
     result = evaluate(RandomAgent(), "bus14-T0", scenarios=MONTH, **keywords)
     args = a_run("bus14-T0", split="train", gamma=0.9, reward="paper", **keywords)
-    means = validator(args, MONTH)(RandomAgent())  # type: ignore[arg-type]
+    means = validator(replace(args, validation_months=1))(RandomAgent())  # type: ignore[arg-type]
     assert means["survival"] == result.summary.survival.value
     assert means["episodic_return"] == result.summary.episode_return.value
     assert means["decisions"] == result.summary.decisions.value

@@ -13,10 +13,9 @@ from pathlib import Path
 from typing import NoReturn
 
 from rl2grid import __version__
-from rl2grid.cli import actions, analyse, data, leaderboard, report, study, watch
+from rl2grid.cli import actions, analyse, data, keywords, leaderboard, report, study, watch
 from rl2grid.cli.train import INTERRUPTED, train
-from rl2grid.engines import ENGINES, HEURISTICS
-from rl2grid.envs.tasks import CONSTRAINTS
+from rl2grid.engines import HEURISTICS
 from rl2grid.errors import UsageError
 from rl2grid.scenarios.splits import SPLITS
 
@@ -116,10 +115,7 @@ def _add_evaluate(commands: argparse._SubParsersAction[_Parser]) -> None:
     parser.add_argument("--months", type=int, default=None, help="of the split, evenly spread; by default all")
     parser.add_argument("--seeds", type=int, default=1, help="episodes per scenario, with seeds 0, 1, ...")
     parser.add_argument("--heuristic", default=None, choices=("None", *HEURISTICS), help="by default the agent's own")
-    parser.add_argument(
-        "--constraint", default=None, choices=("None", *CONSTRAINTS), help="for tasks whose id names none"
-    )
-    parser.add_argument("--engine", default=ENGINES[0], choices=ENGINES, help="native (default), or Grid2Op itself")
+    keywords.add_flags(parser)
     parser.add_argument(
         "--workers", type=int, default=None, help="processes; by default this one (native) or one per core (reference)"
     )

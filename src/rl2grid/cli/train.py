@@ -9,6 +9,7 @@ from dataclasses import Field, dataclass, fields, make_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rl2grid.cli.keywords import NAMES, reward_of
 from rl2grid.envs.tasks import TaskOptions, find_task
 from rl2grid.errors import UsageError, one_of
 from rl2grid.experiments.limits import TimeLimit
@@ -41,9 +42,11 @@ class TrainFlags:
     heuristic: str | None = None
     """What plays while the grid is safe: None, ``idle`` or ``recovery``."""
     reward: str = "default"
-    """Reward preset: ``default``, ``paper`` or ``released``."""
+    """Reward preset, ``default``, ``paper`` or ``released``, or weights of its three components: ``1,0.5,0``."""
     constraint: str | None = None
     """Safety constraint: ``LSI`` or ``TLO``, for tasks whose id names none; None: that of the id."""
+    normalize: str | None = "physical"
+    """``physical``: divide observations by constants of the grid; None: physical units."""
     engine: str = "native"
     """``native``, or ``reference``: Grid2Op itself."""
     dispatch: str = "exact"
@@ -58,6 +61,8 @@ class TrainFlags:
     """Reference engine: processes that play them; None: one per processor core. No influence on results."""
     evaluate_every: int = 50_000
     """Decisions between two evaluations on the validation scenarios."""
+    validation_months: int | None = None
+    """Validation scenarios that are played, evenly spread; None: all."""
     validate: bool = True
     """Whether the best policy is picked on the validation scenarios."""
     checkpoint_seconds: float = 60.0
@@ -76,9 +81,6 @@ class ResumeFlags:
 
     max_minutes: float | None = None
     """Minutes after which the run stops again with a checkpoint; None: no limit."""
-
-
-_ENV_KEYWORDS = ("constraint", "engine", "heuristic", "reward", "dispatch", "maintenance", "opponent")
 
 
 def train(command_line: list[str]) -> int:
@@ -127,7 +129,8 @@ def _begin(algorithm: str, task_id: str, flags: list[str]) -> int:
     _refuse_unknown(flags, [*fields(TrainFlags), *fields(chosen.args)])
     own, hyperparameters = _parse_both(f"rl2grid train {algorithm} {task.id}", flags, hyperparameters)
     limit = TimeLimit(own.max_minutes)
-    keywords = {name: getattr(own, name) for name in _ENV_KEYWORDS}
+    keywords = {name: getattr(own, name) for name in ("heuristic", *NAMES)}
+    keywords["reward"] = reward_of(own.reward)
     TaskOptions(**keywords)
     args = runs.RunArgs(
         task=task.id,
@@ -139,6 +142,7 @@ def _begin(algorithm: str, task_id: str, flags: list[str]) -> int:
         num_workers=own.num_workers,
         checkpoint_seconds=own.checkpoint_seconds,
         evaluate_every=own.evaluate_every,
+        validation_months=own.validation_months,
         wandb_project=own.wandb_project if own.track else None,
     )
     folder = runs.train(args, evaluate=validator(args) if own.validate else None, limit=limit)

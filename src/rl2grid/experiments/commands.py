@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
-from rl2grid.envs.tasks import TaskOptions, short_id
+from rl2grid.envs.tasks import short_id
 from rl2grid.experiments import runs
+from rl2grid.experiments.flags import environment_flags, flags
 
 WITHOUT_INFLUENCE = frozenset({"torch_threads", "device"})
 """Hyperparameters that say where is computed, not what."""
@@ -24,15 +23,15 @@ def train_command(args: runs.RunArgs, preset: str = "default") -> str:
     """
     words = ["rl2grid", "train", args.algorithm, short_id(args.task)]
     words += ["--preset", preset] if preset != "default" else []
-    defaults = asdict(TaskOptions())
-    keywords = {name: value for name, value in args.env_keywords.items() if value != defaults[name]}
     chosen, original = asdict(args.hyperparameters), asdict(runs.hyperparameters(args.algorithm, args.task, preset))
     changes = {name: value for name, value in chosen.items() if value != original[name]}
     for name in WITHOUT_INFLUENCE & set(changes):
         del changes[name]
-    words += flags({**keywords, **changes})
+    words += [*environment_flags(args.env_keywords), *flags(changes)]
     if args.evaluate_every != runs.RunArgs.evaluate_every:
         words += ["--evaluate-every", str(args.evaluate_every)]
+    if args.validation_months is not None:
+        words += ["--validation-months", str(args.validation_months)]
     return shlex.join(words)
 
 
@@ -44,15 +43,3 @@ def training_command(folder: Path) -> str:
     """
     args, _ = runs.read_config(folder)
     return f"{train_command(args)} {shlex.join(('--folder', str(folder)))}"
-
-
-def flags(values: Mapping[str, Any]) -> list[str]:
-    """Flags of the command line that set values, by name."""
-    words = []
-    for name, value in values.items():
-        flag = name.replace("_", "-")
-        if isinstance(value, bool):
-            words.append(f"--{flag}" if value else f"--no-{flag}")
-            continue
-        words += [f"--{flag}", *map(str, value if isinstance(value, tuple | list) else (value,))]
-    return words

@@ -41,13 +41,14 @@ from rl2grid.envs.registration import register_all
 from rl2grid.envs.tasks import Task, TaskOptions, constraint_of, find_task
 from rl2grid.errors import UsageError, one_of
 from rl2grid.experiments.energy import EnergyAccount
+from rl2grid.experiments.evaluation import evenly_spread
 from rl2grid.experiments.interrupts import stop_requests
 from rl2grid.experiments.limits import TimeLimit
 from rl2grid.experiments.tracking import check_tracking, tracked
 from rl2grid.mdp.actions import action_set_hash
 from rl2grid.mdp.constraints import THRESHOLDS
 from rl2grid.scenarios.library import generator_version, scenario_pack_hash
-from rl2grid.scenarios.splits import TRAIN
+from rl2grid.scenarios.splits import TRAIN, VALIDATION
 from rl2grid.versions import library_versions
 
 CONFIG_FILE = "config.json"
@@ -133,6 +134,8 @@ class RunArgs:
     """A checkpoint is written when the last one is older than this, and at the end."""
     evaluate_every: int = 50_000
     """Decisions between two evaluations on the validation scenarios; there is one more at the end."""
+    validation_months: int | None = None
+    """Validation scenarios that are played, evenly spread; None: all."""
     tensorboard: bool = True
     """Whether to write TensorBoard events beside ``metrics.csv``."""
     wandb_project: str | None = None
@@ -491,6 +494,7 @@ def _resolved(args: RunArgs) -> RunArgs:
         raise UsageError(f"Training on the {keywords['split']} scenarios is refused: choose split {TRAIN!r}.")
     if args.evaluate_every < 1:
         raise UsageError(f"evaluate_every must be at least 1 decision, not {args.evaluate_every}.")
+    evenly_spread(task.id, VALIDATION, args.validation_months)
     check_tracking(args.wandb_project)
     folder = args.folder or Path("runs") / f"{_slug(task)}-{args.algorithm}-{args.hyperparameters.seed}"
     resolved = replace(args, task=task.id, folder=Path(folder), env_keywords=keywords)

@@ -110,9 +110,10 @@ class Cell:
         """Decisions to train for; 0 for agents that need no training."""
         return self.training.resolved(self.task).total_timesteps if self.training else 0
 
-    def scenarios(self, split: str) -> tuple[str, ...]:
-        """The months that are played of a split."""
-        return evenly_spread(self.task, split, self.months)
+    @property
+    def scenarios(self) -> tuple[str, ...]:
+        """The months that are played."""
+        return evenly_spread(self.task, self.split, self.months)
 
 
 @dataclass(frozen=True)

@@ -36,8 +36,9 @@ from rl2grid.analysis.sources import CELL_FILE, EVALUATION_FOLDER, RESULT_FILE, 
 from rl2grid.analysis.training import METRICS_FILE
 from rl2grid.errors import UsageError
 from rl2grid.experiments import runs
-from rl2grid.experiments.commands import flags
+from rl2grid.experiments.commands import train_command
 from rl2grid.experiments.evaluation import evaluate
+from rl2grid.experiments.flags import evaluate_command
 from rl2grid.experiments.study import Cell, Training, cell_from_dict, cell_to_dict
 from rl2grid.experiments.validation import validator
 
@@ -102,20 +103,12 @@ def is_busy(folder: Path) -> bool:
 
 def commands(folder: Path, cell: Cell) -> list[str]:
     """What to type to obtain the cell by hand."""
-    run, words = folder / RUN_FOLDER, ["rl2grid"]
-    training = cell.training
-    lines = []
-    if training is not None:
-        train = [*words, "train", training.algorithm, cell.task, "--preset", training.preset]
-        train += ["--seed", str(training.seed)]
-        train += [] if cell.heuristic is None else ["--heuristic", cell.heuristic]
-        train += flags({**cell.environment, **training.hyperparameters})
-        lines.append(shlex.join([*train, "--folder", str(run)]))
-    agent = cell.agent if training is None else str(run)
-    play = [*words, "evaluate", agent, cell.task, "--split", cell.split, "--seeds", str(cell.evaluation_seeds)]
-    play += [] if cell.months is None else ["--months", str(cell.months)]
-    lines.append(shlex.join([*play, "--heuristic", cell.heuristic or "None"]))
-    return lines
+    keywords, lines, agent = {"heuristic": cell.heuristic, **cell.environment}, [], cell.agent
+    if cell.training is not None:
+        run = folder / RUN_FOLDER
+        train = train_command(_run_args(cell, cell.training, run), cell.training.preset)
+        lines, agent = [f"{train} {shlex.join(('--folder', str(run)))}"], str(run)
+    return [*lines, evaluate_command(agent, cell.task, cell.split, cell.evaluation_seeds, cell.months, keywords)]
 
 
 def run_cell(folder: Path) -> None:
@@ -143,7 +136,7 @@ def _finish(folder: Path) -> None:
         agent,
         cell.task,
         split=cell.split,
-        scenarios=cell.scenarios(cell.split),
+        scenarios=cell.scenarios,
         seeds=range(cell.evaluation_seeds),
         heuristic=cell.heuristic,
         workers=0,
@@ -162,14 +155,18 @@ def _finish(folder: Path) -> None:
 
 
 def _train(cell: Cell, training: Training, folder: Path) -> None:
-    scenarios = cell.scenarios("validation")
     if folder.exists():
         if not runs.is_finished(folder):
-            runs.resume(folder, evaluate=validator(runs.read_config(folder)[0], scenarios))
+            runs.resume(folder, evaluate=validator(runs.read_config(folder)[0]))
         return
+    args = _run_args(cell, training, folder)
+    runs.train(args, evaluate=validator(args))
+
+
+def _run_args(cell: Cell, training: Training, folder: Path) -> runs.RunArgs:
     hyperparameters = training.resolved(cell.task)
     native = cell.environment.get("engine", "native") == "native"
-    args = runs.RunArgs(
+    return runs.RunArgs(
         task=cell.task,
         hyperparameters=hyperparameters,
         algorithm=training.algorithm,
@@ -178,9 +175,9 @@ def _train(cell: Cell, training: Training, folder: Path) -> None:
         num_threads=1 if native else None,
         num_workers=None if native else 0,
         evaluate_every=max(hyperparameters.total_timesteps // training.validations, 1),
+        validation_months=cell.months,
         progress=False,
     )
-    runs.train(args, evaluate=validator(args, scenarios))
 
 
 class CellProcess:

@@ -101,7 +101,7 @@ class CellState:
     @property
     def episodes(self) -> int:
         """Episodes to evaluate."""
-        return len(self.cell.scenarios(self.cell.split)) * self.cell.evaluation_seeds
+        return len(self.cell.scenarios) * self.cell.evaluation_seeds
 
 
 class MetricsTail:

@@ -39,7 +39,6 @@ from rl2grid.envs.tasks import find_task
 from rl2grid.errors import UsageError
 from rl2grid.experiments import runs
 from rl2grid.experiments.commands import train_command
-from rl2grid.experiments.evaluation import evenly_spread
 from rl2grid.experiments.interrupts import stop_requests
 from rl2grid.experiments.study import NO_HEURISTIC
 from rl2grid.experiments.study_cell import STOPPED, CellProcess, is_busy, serve
@@ -218,8 +217,9 @@ def run_tuning(
 def best_command(tuning: Tuning, best: Best) -> str:
     """What to type to train with a configuration."""
     args = _run_args(tuning, tuning.resolved(best.hyperparameters), None)
-    # Not as often validated as while searching, where that is for ending poor trials.
-    return train_command(replace(args, evaluate_every=runs.RunArgs.evaluate_every), tuning.preset)
+    # Validated on all months, and not as often as while searching, where that is for ending poor trials.
+    args = replace(args, evaluate_every=runs.RunArgs.evaluate_every, validation_months=None)
+    return train_command(args, tuning.preset)
 
 
 def work(folder: Path) -> None:
@@ -252,9 +252,8 @@ def _train(tuning: Tuning, trial: Any) -> float:
         raise optuna.TrialPruned from None
     folder = _trial_folder(tuning, chosen)
     trial.set_user_attr("run", folder.name)
-    scenarios = evenly_spread(tuning.task, "validation", tuning.months)
     args = _run_args(tuning, hyperparameters, folder)
-    validate = validator(args, scenarios)
+    validate = validator(args)
     reports = Reports(trial, folder, runs.find_limits(args))
 
     def report(agent: PolicyAgent) -> Mapping[str, float]:
@@ -280,6 +279,7 @@ def _run_args(tuning: Tuning, hyperparameters: runs.Hyperparameters, folder: Pat
         env_keywords={"heuristic": tuning.heuristic},
         num_threads=1,
         evaluate_every=max(tuning.budget // tuning.validations, 1),
+        validation_months=tuning.months,
         tensorboard=False,
         progress=False,
     )

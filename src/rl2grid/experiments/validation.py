@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from rl2grid.algorithms.policy_agent import PolicyAgent
 from rl2grid.analysis.summary import safe_episodes
 from rl2grid.experiments import runs
-from rl2grid.experiments.evaluation import evaluate
+from rl2grid.experiments.evaluation import evaluate, evenly_spread
 
 OF_TRAINING = ("split", "scenario", "gamma", "reward")
 """Keywords of the training environments that validation does not take over."""
 
 
-def validator(args: runs.RunArgs, scenarios: Sequence[str] | None = None) -> runs.Evaluate:
+def validator(args: runs.RunArgs) -> runs.Evaluate:
     """A function that plays the validation scenarios as the run plays its own and returns means over episodes.
 
     It returns ``survival``, ``completed``, ``episodic_return``, ``cost_lsi``, ``cost_tlo`` and ``decisions``, and
@@ -23,12 +21,12 @@ def validator(args: runs.RunArgs, scenarios: Sequence[str] | None = None) -> run
     Args:
         args: the run: its task, its keywords of the environment and its number of processes are those of validation,
             with the default rewards.
-        scenarios: play these only; None: all of the split.
 
     Raises:
         UsageError: the run cannot be constrained as asked.
     """
     limits = runs.find_limits(args)
+    scenarios = evenly_spread(args.task, "validation", args.validation_months)
     keywords = {name: value for name, value in args.env_keywords.items() if name not in OF_TRAINING}
 
     def validate(agent: PolicyAgent) -> dict[str, float]:

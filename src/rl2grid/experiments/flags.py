@@ -1,0 +1,53 @@
+"""Flags of the command line, for commands that ask for something again."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+from rl2grid.envs.tasks import TaskOptions, short_id
+
+_GIVEN_OTHERWISE = ("heuristic", "split")
+
+
+def flags(values: Mapping[str, Any]) -> list[str]:
+    """Flags that set values, by name."""
+    words = []
+    for name, value in values.items():
+        flag = name.replace("_", "-")
+        if isinstance(value, bool):
+            words.append(f"--{flag}" if value else f"--no-{flag}")
+            continue
+        words += [f"--{flag}", *map(str, value if isinstance(value, tuple | list) else (value,))]
+    return words
+
+
+def environment_flags(keywords: Mapping[str, Any]) -> list[str]:
+    """Flags for those keywords of ``gymnasium.make`` that are not at their defaults."""
+    defaults = asdict(TaskOptions())
+    changes = {name: value for name, value in keywords.items() if value != defaults[name]}
+    if isinstance(changes.get("reward"), tuple | list):
+        changes["reward"] = ",".join(map(str, changes["reward"]))
+    return flags(changes)
+
+
+def evaluate_command(
+    agent: str, task_id: str, split: str, seeds: int, months: int | None, keywords: Mapping[str, Any]
+) -> str:
+    """The ``rl2grid evaluate`` that plays an agent like that.
+
+    Args:
+        agent: name, run folder or checkpoint.
+        task_id: id of the task.
+        split: whose months.
+        seeds: episodes per month.
+        months: of the split, evenly spread; None: all.
+        keywords: of ``gymnasium.make``; without ``heuristic``, the one that the agent was trained with is played.
+    """
+    words = ["rl2grid", "evaluate", agent, short_id(task_id), "--split", split, "--seeds", str(seeds)]
+    words += [] if months is None else ["--months", str(months)]
+    words += ["--heuristic", str(keywords["heuristic"])] if "heuristic" in keywords else []
+    others = {name: value for name, value in keywords.items() if name not in _GIVEN_OTHERWISE}
+    return shlex.join([*words, *environment_flags(others)])
