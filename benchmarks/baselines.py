@@ -10,9 +10,10 @@ the environment) that is in the ledger is not played again: what was chosen afte
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -144,54 +145,68 @@ def enter(digest: str, entry: Mapping[str, Any]) -> None:
 
 
 def table() -> str:
-    """The ledger as Markdown: tasks in order, trained agents by validation survival."""
+    """The ledger as Markdown: a row per configuration, its seeds together; tasks in order, trained agents last."""
     lines = [
-        "| task | agent | heuristic | seed | decisions (grid steps) | minutes | validation | test survival | completed "
+        "| task | agent | heuristic | decisions (grid steps) | minutes | validation | test survival | completed "
         "| cost TLO | P(TLO safe) | P(LSI safe) |",
-        "|---|---|---|---|---|---|---|---|---|---|---|---|",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
-    for entry in sorted(read_ledger().values(), key=_place):
-        lines.append("| " + " | ".join(_cells(entry)) + " |")
+    entries = sorted(read_ledger().values(), key=_place)
+    for _, group in itertools.groupby(entries, key=lambda entry: _place(entry)[:-1]):
+        lines.append("| " + " | ".join(_cells(list(group))) + " |")
     return "\n".join(lines)
 
 
 def _place(entry: Mapping[str, Any]) -> tuple[Any, ...]:
+    """Where an entry stands; entries that differ in the last element alone are seeds of one configuration."""
     configuration = entry["configuration"]
+    others = dict(configuration.get("hyperparameters", {}))
+    seed = others.pop("seed", 0)
+    name = configuration.get("algorithm") or configuration["agent"]
+    what = identity_hash({**configuration, "hyperparameters": others})
     trained = "algorithm" in configuration
-    name = configuration["algorithm"] if trained else configuration["agent"]
-    return configuration["task"], trained, name, str(_heuristic(configuration)), _seed(configuration)
+    return configuration["task"], trained, name, str(_heuristic(configuration)), what, seed
 
 
-def _cells(entry: Mapping[str, Any]) -> list[str]:
-    configuration, training, figures = entry["configuration"], entry["training"], entry["test"]
-    survival, low, high = figures["survival"]
+def _cells(group: Sequence[Mapping[str, Any]]) -> list[str]:
+    configuration, training = group[0]["configuration"], [entry["training"] for entry in group]
     cells = [
         short_id(configuration["task"]),
         configuration.get("algorithm") or configuration["agent"],
         _heuristic(configuration) or "none",
-        _seed(configuration),
     ]
-    if training:
-        cells += [
-            f"{training['decisions']:,} ({training['grid_steps'] / 1e6:.1f} M)",
-            f"{training['minutes']:.0f}",
-            f"{training['validation_survival']:.3f}",
-        ]
+    if training[0]:
+        steps = sum(run["grid_steps"] for run in training) / len(group) / 1e6
+        minutes, validation = ([run[name] for run in training] for name in ("minutes", "validation_survival"))
+        cells += [f"{training[0]['decisions']:,} ({steps:.1f} M)", _seeds(minutes, ".0f"), _seeds(validation, ".3f")]
     else:
         cells += ["", "", ""]
-    cells += [f"{survival:.3f} [{low:.3f}, {high:.3f}]", f"{figures['completed'][0]:.0%}"]
-    cells += [f"{figures['cost_tlo'][0]:.0f}", f"{figures['safe_tlo'][0]:.0%}", f"{figures['safe_lsi'][0]:.0%}"]
+    _, low, high = group[0]["test"]["survival"]
+    survival = _seeds(_tested(group, "survival"), ".3f")
+    cells.append(f"{survival} [{low:.3f}, {high:.3f}]" if len(group) == 1 else f"**{_mean(group):.3f}** of {survival}")
+    cells += [_seeds(_tested(group, name), form) for name, form in _TESTED.items()]
     return cells
+
+
+_TESTED = {"completed": ".0%", "cost_tlo": ".0f", "safe_tlo": ".0%", "safe_lsi": ".0%"}
+
+
+def _tested(group: Sequence[Mapping[str, Any]], name: str) -> list[float]:
+    return [entry["test"][name][0] for entry in group]
+
+
+def _mean(group: Sequence[Mapping[str, Any]]) -> float:
+    return sum(_tested(group, "survival")) / len(group)
+
+
+def _seeds(values: Sequence[float], form: str) -> str:
+    return ", ".join(format(value, form) for value in values)
 
 
 def _heuristic(configuration: Mapping[str, Any]) -> str | None:
     keywords = configuration.get("env_keywords", configuration)
     chosen: str | None = keywords["heuristic"]
     return chosen
-
-
-def _seed(configuration: Mapping[str, Any]) -> str:
-    return str(configuration["hyperparameters"]["seed"]) if "hyperparameters" in configuration else ""
 
 
 def main() -> None:
