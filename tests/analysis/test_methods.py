@@ -9,6 +9,7 @@ import pytest
 from sample_results import TASK, result
 
 from rl2grid.analysis.methods import group_methods, resampled_units
+from rl2grid.analysis.results import EvaluationResult
 from rl2grid.analysis.statistics import Unit
 from rl2grid.analysis.training import group_curves, read_training_run
 from rl2grid.errors import UsageError
@@ -38,11 +39,25 @@ def test_dying_early_is_cheap_but_not_safe():
     assert method.within("LSI").values.mean() == 0.5
 
 
+def trained(seeds: tuple[int, int] = (1, 2), algorithms: tuple[str, str] = ("ppo", "ppo")) -> list[EvaluationResult]:
+    return [
+        result("a", [[0.5]], agent_hash=f"{k}", agent_identity={"algorithm": name, "trained_with": {"seed": seed}})
+        for k, (seed, name) in enumerate(zip(seeds, algorithms, strict=True))
+    ]
+
+
+def test_trainings_with_other_seeds_are_one_method():
+    (method,) = group_methods(trained())[TASK]
+    assert method.scores("survival").unit is Unit.RUN
+
+
 @pytest.mark.parametrize(
     ("others", "sentence"),
     [
         ([], "at least one evaluation"),
         ([result("a", [[1.0]]), result("a", [[0.5]])], "given twice"),
+        (trained(seeds=(1, 1)), "different policies trained with seed 1"),
+        (trained(algorithms=("ppo", "sac")), "by ppo and by sac: tell them apart"),
         ([result("a", [[1.0]]), result("b", [[0.5]], versions={"rl2grid": "1"})], "different versions"),
         ([result("a", [[1.0]]), result("b", [[0.5], [0.4]])], "different scenarios or seeds"),
         ([result("a", [[1.0]]), result("a", [[1.0]], task=OTHER_TASK, engine="reference")], "different engine"),

@@ -114,8 +114,35 @@ def _methods(results: Sequence[EvaluationResult]) -> tuple[Method, ...]:
                 f"The same evaluation of {result.episodes[0].agent} on {result.episodes[0].task} was given twice: "
                 "leave one out."
             )
+        _check_other_training(result, group)
         group.append(result)
     return tuple(Method(tuple(group)) for group in groups.values())
+
+
+def _check_other_training(result: EvaluationResult, group: Sequence[EvaluationResult]) -> None:
+    """Evaluations of one method are repeated trainings: of other seeds, by the same algorithm."""
+    mine = _training(result)
+    if mine is None:
+        return
+    who, task = result.episodes[0].agent, result.episodes[0].task
+    for theirs in filter(None, map(_training, group)):
+        if mine[0] != theirs[0]:
+            raise UsageError(
+                f"Evaluations called {who} on {task} are of policies by {theirs[0]} and by {mine[0]}: tell them "
+                "apart as LABEL=FOLDER."
+            )
+        if mine[1] == theirs[1]:
+            raise UsageError(
+                f"Two evaluations of {who} on {task} are of different policies trained with seed {mine[1]}: leave one "
+                "out, or tell them apart as LABEL=FOLDER."
+            )
+
+
+def _training(result: EvaluationResult) -> tuple[str | None, int] | None:
+    """Algorithm and seed with which the agent was trained; None where its identity does not say."""
+    identity = result.identity.get("agent_identity") or {}
+    seed = identity.get("trained_with", {}).get("seed")
+    return None if seed is None else (identity.get("algorithm"), int(seed))
 
 
 def _check_same_question(results: Sequence[EvaluationResult]) -> None:
