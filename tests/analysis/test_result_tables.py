@@ -54,8 +54,8 @@ def test_survival_has_the_shape_of_the_paper():
         ("", "Env."),
         ("", "Diff."),
         ("Baselines", "do-nothing"),
-        ("PPO", "V"),
-        ("PPO", "R"),
+        ("ppo", "V"),
+        ("ppo", "R"),
     ]
     assert texts(table.rows[0]) == ["bus14", "0", "0.15 ± 0.05", "0.40 ± 0.10", "0.95 ± 0.05"]
     assert [cell.best for cell in table.rows[0]] == [False, False, False, False, True]

@@ -282,7 +282,7 @@ def _places(methods: Iterable[Method]) -> list[tuple[str, str]]:
 
 def _place(method: Method) -> tuple[str, str]:
     if method.is_trained:
-        return method.agent.upper() if method.agent.islower() else method.agent, HEURISTIC_LETTERS[method.heuristic]
+        return method.agent, HEURISTIC_LETTERS[method.heuristic]
     letter = "" if method.heuristic == "none" else f" ({HEURISTIC_LETTERS[method.heuristic]})"
     return _BASELINES, f"{method.agent}{letter}"
 
