@@ -148,6 +148,15 @@ def test_each_method_alone_and_in_the_dark_can_be_drawn():
             assert picture.draw(DARK).axes
 
 
+def test_labels_make_names_of_files_that_can_be_and_differ(tmp_path):
+    labels = ("PPO w/o masks", "PPO w-o masks", "ppo W/O masks")
+    names = [one.name for one in plan_section([result(label, [[0.5], [1.0]]) for label in labels]).pictures]
+    assert len({name.lower() for name in names}) == len(names)
+    for name in names:
+        (tmp_path / f"{name}.png").touch()
+    assert {"endings-map-bus14-T0-PPO-w-o-masks", "endings-map-bus14-T0-PPO-w-o-masks-2"} <= set(names)
+
+
 def test_without_results_there_is_no_section(tmp_path):
     with pytest.raises(UsageError, match="nothing to analyse"):
         results_section(tmp_path / "out", [])

@@ -16,7 +16,7 @@ from PIL import Image
 
 from rl2grid.analysis import figures
 from rl2grid.analysis.explorer import explorer_html
-from rl2grid.analysis.methods import Method, group_methods, method_label
+from rl2grid.analysis.methods import Method, method_label
 from rl2grid.analysis.page import (
     commands_html,
     facts_html,
@@ -74,9 +74,9 @@ def write_results_page(
         UsageError: nothing is given, or results or runs that do not belong together; nothing was written.
     """
     section = plan or plan_section(sources.results, sources.runs)
-    methods = group_methods(sources.results) if sources.results else {}
     drawn = [_draw(picture, on_figure) for picture in section.pictures]
-    before = [_header(title, sources, methods), *_missing(sources.missing), *_rankings(methods, sources.results)]
+    before = [_header(title, sources, section.methods)]
+    before += [*_missing(sources.missing), *_rankings(section.methods, sources.results)]
     before += _tables(section)
     after = [explorer_html(sources.results, _places("e", sources.results))] if sources.results else []
     after += [_commands(sources, command, train_commands)]

@@ -9,7 +9,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -51,6 +53,8 @@ class Picture:
 class Section:
     """What a results section is made of."""
 
+    methods: Methods
+    """By task; empty where nothing but training runs was given."""
     tables: tuple[ResultTable, ...]
     pictures: tuple[Picture, ...]
 
@@ -69,7 +73,7 @@ def plan_section(results: Sequence[EvaluationResult], runs: Sequence[TrainingRun
         raise UsageError("There is nothing to analyse: give at least one evaluation or training run.")
     methods = group_methods(results) if results else {}
     pictures = [*training_pictures(group_curves(runs)), *evaluation_pictures(methods)]
-    return Section(result_tables(methods) if methods else (), tuple(pictures))
+    return Section(methods, result_tables(methods) if methods else (), tuple(_distinct(pictures)))
 
 
 def results_section(
@@ -171,13 +175,27 @@ def _task_pictures(short: str, group: tuple[Method, ...]) -> Iterator[Picture]:
 def _ending_pictures(short: str, method: Method) -> Iterator[Picture]:
     grid, episodes = method.task.grid, method.episodes
     title = f"Where grids collapse: {method.label} on {short}"
-    name = f"{short}-{method.label}".replace(" + ", "-").replace(" ", "-")
+    name = f"{short}-{_file_name(method.label)}"
     for kind, draw, words in (("bars", draw_ending_bars, "in numbers"), ("map", draw_ending_map, "on the grid")):
         yield Picture(
             f"endings-{kind}-{name}",
             f"Lines and substations with which episodes of {method.label} on {short} were lost, {words}.",
             lambda theme, draw=draw: draw(grid, episodes, title=title, theme=theme),  # type: ignore[misc]
         )
+
+
+def _file_name(label: str) -> str:
+    """A label as part of the name of a file."""
+    return re.sub(r"[^\w.]+", "-", label).strip("-")
+
+
+def _distinct(pictures: Iterable[Picture]) -> Iterator[Picture]:
+    """The pictures, those with the name of an earlier one numbered: labels may differ in what names of files lack."""
+    seen: Counter[str] = Counter()
+    for picture in pictures:
+        seen[picture.name.lower()] += 1
+        number = seen[picture.name.lower()]
+        yield picture if number == 1 else replace(picture, name=f"{picture.name}-{number}")
 
 
 def _of_methods(name: str, place: str, methods: Sequence[Method], words: str, draw: Callable[..., Figure]) -> Picture:
