@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import matplotlib
@@ -78,6 +79,8 @@ def test_the_ending_is_told():
     assert "game over" not in completed
     assert any("survived 700 of 1,400 steps; the grid fell into several pieces" in text for text in lost)
     assert any("the episode was completed" in text for text in completed)
+    cut_off = texts(episode_loading(replace(recording(game_over=""), episode_length=8064)))
+    assert any("survived 700 of 8,064 steps; it was not played further" in text for text in cut_off)
     assert "acts (1)" in lost
     assert "decides (2)" in lost
     assert "attacked" in lost

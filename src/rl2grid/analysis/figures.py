@@ -325,7 +325,8 @@ def _episode_words(recording: Recording) -> tuple[str, str]:
     task = recording.task.removeprefix("rl2grid/")
     with_heuristic = "" if recording.heuristic == "none" else f" + {recording.heuristic}"
     survived = f"survived {recording.n_steps:,} of {recording.episode_length:,} steps"
-    ending = recording.game_over or "the episode was completed"
+    completed = recording.n_steps >= recording.episode_length
+    ending = recording.game_over or ("the episode was completed" if completed else "it was not played further")
     return (
         f"Line loading: {recording.agent}{with_heuristic} on {task}",
         f"scenario {recording.scenario}, seed {recording.seed}: {survived}; {ending}",
