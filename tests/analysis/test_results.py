@@ -7,10 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from rich.console import Console
-from sample_results import episode, recording, result
+from sample_results import episode, result
 
 from rl2grid.analysis.episodes import COLUMNS, read_episodes, write_episodes
-from rl2grid.analysis.recordings import load_recording, save_recording
 from rl2grid.analysis.results import check_comparable, load_evaluation
 from rl2grid.analysis.summary import by_scenario, summarise
 from rl2grid.analysis.tables import HEADINGS, markdown_table, rich_table
@@ -48,8 +47,6 @@ def test_missing_files_are_refused(tmp_path):
         read_episodes(tmp_path / "none.csv")
     with pytest.raises(UsageError, match="holds no evaluation"):
         load_evaluation(tmp_path)
-    with pytest.raises(UsageError, match="is no recording"):
-        load_recording(tmp_path / "none.npz")
     with pytest.raises(UsageError, match="is no metrics file"):
         read_training_curve(tmp_path, "ppo")
 
@@ -120,18 +117,6 @@ def test_only_comparable_results_share_a_table():
         check_comparable([first, result("b", [[0.5, 0.6]])])
     with pytest.raises(UsageError, match="at least one"):
         check_comparable([])
-
-
-def test_recordings_survive_a_file(tmp_path):
-    original = recording()
-    save_recording(tmp_path / "episode.npz", original)
-    loaded = load_recording(tmp_path / "episode.npz")
-    for name in ("rho", "line_status", "attacked", "maintained"):
-        np.testing.assert_array_equal(getattr(loaded, name), getattr(original, name))
-        assert getattr(loaded, name).dtype == getattr(original, name).dtype
-    for name in ("line_names", "decision_steps", "actions", "game_over", "scenario", "episode_length"):
-        assert getattr(loaded, name) == getattr(original, name)
-    assert loaded.n_steps == 700
 
 
 METRICS = """step,grid_steps,wall_time,name,value

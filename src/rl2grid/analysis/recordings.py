@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-import json
-import os
-from dataclasses import dataclass, fields
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-
-from rl2grid.errors import UsageError
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,35 +53,3 @@ class Recording:
     def n_steps(self) -> int:
         """Steps survived."""
         return len(self.rho) - 1
-
-
-_ARRAYS = ("rho", "line_status", "attacked", "maintained", "topo_vect", "gen_p", "load_p", "storage_power")
-_WORDS = "description"
-
-
-def save_recording(path: Path, recording: Recording) -> None:
-    """Write a recording (NumPy's ``.npz``), whole or not at all."""
-    values = {field.name: getattr(recording, field.name) for field in fields(recording)}
-    arrays: dict[str, Any] = {name: values.pop(name) for name in _ARRAYS}
-    arrays[_WORDS] = np.array(json.dumps(values))
-    temporary = path.with_name(f"{path.name}.tmp")
-    with temporary.open("wb") as file:
-        np.savez_compressed(file, **arrays)
-    os.replace(temporary, path)
-
-
-def load_recording(path: Path) -> Recording:
-    """Read a recording.
-
-    Raises:
-        UsageError: the file is missing or no recording.
-    """
-    try:
-        with np.load(path) as file:
-            words = json.loads(str(file[_WORDS]))
-            arrays = {name: file[name] for name in _ARRAYS}
-    except (OSError, ValueError, KeyError) as error:
-        raise UsageError(f"{path} is no recording of an episode: {error}.") from None
-    for name, value in words.items():
-        words[name] = tuple(value) if isinstance(value, list) else value
-    return Recording(**words, **arrays)

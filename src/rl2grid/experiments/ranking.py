@@ -76,7 +76,6 @@ _TRUST, _RELIEF_WEIGHT = 0.7, 0.001
 _CHUNK = 4096  # actions whose statistics are computed at once
 _UNTRIED = np.float16(np.nan)
 
-F16 = NDArray[np.float16]
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
