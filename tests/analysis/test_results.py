@@ -13,7 +13,7 @@ from rl2grid.analysis.episodes import COLUMNS, read_episodes, write_episodes
 from rl2grid.analysis.results import check_comparable, load_evaluation
 from rl2grid.analysis.summary import by_scenario, summarise
 from rl2grid.analysis.tables import HEADINGS, markdown_table, rich_table
-from rl2grid.analysis.training import read_training_curve
+from rl2grid.analysis.training import read_training_curve, read_validations
 from rl2grid.errors import UsageError
 
 
@@ -151,3 +151,15 @@ def test_replacing_a_row_changes_only_it():
     rows = [episode(seed=0), episode(seed=1)]
     better = summarise([rows[0], replace(rows[1], survival=0.5)])
     assert better.survival.value == 0.75
+
+
+@pytest.mark.parametrize("cut", [1, 3, 12, 24])
+def test_a_torn_last_line_of_metrics_is_ignored(tmp_path, cut):
+    head = "step,grid_steps,wall_time,name,value\n"
+    rows = [f"{step},9,0.5,{kind}/survival,0.{step}" for step in (10, 25) for kind in ("charts", "validation")]
+    (tmp_path / "metrics.csv").write_text((head + "\n".join(rows) + "\n")[:-cut])
+    assert read_validations(tmp_path) == {10: {"survival": 0.1}}
+    curve = read_training_curve(tmp_path, "ppo")
+    assert curve.validation is not None
+    assert curve.validation.values.tolist() == [0.1]
+    assert curve.survival.values.tolist() == [0.1, 0.25]

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -74,13 +75,14 @@ def read_training_curve(path: Path, label: str) -> TrainingCurve:
         path: ``metrics.csv``, or the run folder that holds it.
         label: what figures call the run; runs with one label are drawn as one line.
 
+    A last line without its end, as a killed run leaves it, is ignored.
+
     Raises:
         UsageError: the file is missing, no metrics file, or no episode ended yet.
     """
     path = path / METRICS_FILE if path.is_dir() else path
     try:
-        with path.open(encoding="utf-8", newline="") as file:
-            rows = [[row[column] for column in _COLUMNS] for row in csv.DictReader(file)]
+        rows = [[row[column] for column in _COLUMNS] for row in _read_rows(path)]
         points = [(name, float(step), float(grid_steps), float(value)) for step, grid_steps, name, value in rows]
     except (OSError, KeyError, TypeError, ValueError):
         raise UsageError(
@@ -133,10 +135,9 @@ def read_validations(folder: Path) -> dict[int, dict[str, float]]:
     if not path.exists():
         return {}
     validations: dict[int, dict[str, float]] = {}
-    with path.open(encoding="utf-8", newline="") as file:
-        for row in csv.DictReader(file):
-            if row["name"].startswith(prefix):
-                validations.setdefault(int(row["step"]), {})[row["name"].removeprefix(prefix)] = float(row["value"])
+    for row in _read_rows(path):
+        if row["name"].startswith(prefix):
+            validations.setdefault(int(row["step"]), {})[row["name"].removeprefix(prefix)] = float(row["value"])
     return validations
 
 
@@ -170,6 +171,12 @@ def _check_one_method(label: str, runs: Sequence[TrainingRun]) -> None:
                 )
         if run.seed in {earlier.seed for earlier in runs[:place]}:
             raise UsageError(f"Two runs of {label} on {run.task} have seed {run.seed}: leave out {run.folder}.")
+
+
+def _read_rows(path: Path) -> Iterator[dict[str, str]]:
+    """The rows of a metrics file. A last line without its end, as a killed writer leaves it, is ignored."""
+    text = path.read_text(encoding="utf-8")
+    return csv.DictReader(io.StringIO(text[: text.rfind("\n") + 1]))
 
 
 def _metrics(points: list[tuple[str, float, float, float]]) -> dict[str, Metric]:
