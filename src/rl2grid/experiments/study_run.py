@@ -112,25 +112,31 @@ class MetricsTail:
         self.best: float | None = None
         """Highest survival on the validation scenarios."""
         self._path, self._offset = path, 0
+        self._last = b""
+        """The last line that was read, which ends at the offset."""
 
     def read(self) -> None:
         """Take in what was appended."""
         if not self._path.exists():
             return
-        if self._path.stat().st_size < self._offset:  # a resumed run cut it back
-            self.decisions, self.best, self._offset = 0, None, 0
         with self._path.open("rb") as file:
-            file.seek(self._offset)
+            file.seek(self._offset - len(self._last))
+            if file.read(len(self._last)) != self._last:  # a resumed run cut it back, and perhaps wrote on since
+                self.decisions, self.best, self._offset, self._last = 0, None, 0, b""
+                file.seek(0)
             text = file.read()
-        complete = text[: text.rfind(b"\n") + 1]
-        self._offset += len(complete)
-        for line in complete.decode("utf-8").splitlines():
-            step, _, _, name, value = line.split(",")
-            if step == "step":
-                continue
-            self.decisions = int(step)
-            if name == VALIDATION:
-                self.best = max(float(value), self.best or 0.0)
+        lines = text[: text.rfind(b"\n") + 1].splitlines(keepends=True)
+        if not lines:
+            return
+        self._offset, self._last = self._offset + sum(map(len, lines)), lines[-1]
+        for line in lines:
+            match line.decode("utf-8").rstrip("\n").split(","):
+                case ["step", *_]:
+                    continue
+                case [step, _, _, name, value]:
+                    self.decisions = int(step)
+                    if name == VALIDATION:
+                        self.best = max(float(value), self.best or 0.0)
 
 
 def read_states(study: Study) -> list[CellState]:
