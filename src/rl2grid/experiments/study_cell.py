@@ -31,7 +31,6 @@ from filelock import FileLock, Timeout
 
 from rl2grid.analysis.episodes import EPISODES_FILE
 from rl2grid.analysis.files import write_json
-from rl2grid.analysis.results import load_evaluation
 from rl2grid.analysis.sources import CELL_FILE, EVALUATION_FOLDER, RESULT_FILE, RUN_FOLDER
 from rl2grid.analysis.training import METRICS_FILE
 from rl2grid.errors import UsageError
@@ -147,7 +146,7 @@ def _finish(folder: Path) -> None:
     seconds = trained_seconds(folder / RUN_FOLDER) + sum(episode.wall_time_s for episode in result.episodes)
     summary = CellResult(
         minutes=round(seconds / 60.0, 2),
-        identity=load_evaluation(folder / EVALUATION_FOLDER).episodes[0].identity,
+        identity=result.episodes[0].identity,
         survival=result.summary.survival.value,
         episodes=len(result.episodes),
     )

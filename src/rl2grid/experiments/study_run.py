@@ -218,7 +218,7 @@ class _Runner:
         """Let all cells write their checkpoints and end."""
         for job in self._jobs.values():
             job.stop()
-        while self._jobs or any(is_busy(self.states[number].folder) for number in self._jobs):
+        while self._jobs:
             show()
             for number, job in list(self._jobs.items()):
                 status = job.poll()
