@@ -48,6 +48,14 @@ class RandomizedAgent(Protocol):
         """Draw from the stream (``seed``, ``episode``) from the next ``reset`` on."""
 
 
+@runtime_checkable
+class SpecialisedAgent(Protocol):
+    """An agent that cannot play all kinds of task; those without ``kinds`` can."""
+
+    kinds: tuple[str, ...]
+    """``"T"``: topology tasks, ``"R"``: redispatching tasks; ``bind`` refuses the others."""
+
+
 def no_intervention(space: gymnasium.Space[Any]) -> Action:
     """The action that changes nothing: id 0 of a topology task, zeros of a redispatching task."""
     if isinstance(space, gymnasium.spaces.Discrete):

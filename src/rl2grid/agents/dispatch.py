@@ -36,6 +36,7 @@ class Control(NamedTuple):
 class DispatchAgent:
     """What agents that plan redispatch on the DC flow have in common: the grid and its electrical model."""
 
+    kinds = ("R",)
     refusal: ClassVar[str]
     """What is said of tasks without continuous actions."""
 

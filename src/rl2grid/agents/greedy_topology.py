@@ -42,6 +42,7 @@ class GreedyTopology:
     """
 
     name = "greedy"
+    kinds = ("T",)
 
     def __init__(self, actions: Sequence[int] | None = None) -> None:
         self._recovery = Recovery()

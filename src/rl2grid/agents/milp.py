@@ -51,6 +51,7 @@ class Milp:
     """
 
     name = "milp"
+    kinds = ("T",)
 
     def __init__(self, node_limit: int = 100, time_limit: float = 60.0, attempts: int = 3) -> None:
         if node_limit < 1:

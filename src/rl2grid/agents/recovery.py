@@ -24,6 +24,7 @@ class Recovery:
     """
 
     name = "recovery"
+    kinds = ("T",)
 
     def bind(self, env: gymnasium.Env[Any, Any]) -> None:
         """Index the actions of the task, and remember the environment, whose state is looked at.

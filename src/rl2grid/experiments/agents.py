@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from rl2grid.agents.agent import Agent
+from rl2grid.agents.agent import Agent, SpecialisedAgent
 from rl2grid.agents.dc_opf import DcOpf
 from rl2grid.agents.do_nothing import DoNothing
 from rl2grid.agents.greedy import Greedy
@@ -25,6 +25,12 @@ AGENTS: dict[str, Callable[[], Agent]] = {
     DcOpf.name: DcOpf,
 }
 """Agents that need no training, by name."""
+
+
+def kinds_of(name: str) -> tuple[str, ...]:
+    """Kinds of task that an agent of :data:`AGENTS` can play: ``"T"`` (topology), ``"R"`` (redispatching) or both."""
+    agent = AGENTS[name]
+    return agent.kinds if isinstance(agent, SpecialisedAgent) else ("T", "R")
 
 
 def make_agent(spec: str | Path, task_id: str | None = None) -> Agent:

@@ -34,7 +34,7 @@ from rl2grid.engines import HEURISTICS
 from rl2grid.envs.tasks import TaskOptions, find_task
 from rl2grid.errors import UsageError
 from rl2grid.experiments import runs
-from rl2grid.experiments.agents import AGENTS
+from rl2grid.experiments.agents import AGENTS, kinds_of
 from rl2grid.experiments.evaluation import evenly_spread
 from rl2grid.experiments.study_file import (
     as_table,
@@ -55,8 +55,6 @@ NO_HEURISTIC = "none"
 DEFAULT_RETRIES = 2
 DEFAULT_VALIDATIONS = 10
 
-_AGENT_KINDS = {"recovery": "T", "milp": "T", "dc-opf": "R"}
-"""Kinds of task that agents without training can play, where it is not both."""
 _ACTIONS = {"T": "discrete", "R": "continuous"}
 
 _STUDY_KEYS = ("name", "output", "retries", "scale", "group", "slurm")
@@ -297,8 +295,8 @@ class _Group:
 
     def _check_agent(self, agent: str, task: str) -> None:
         kind = find_task(task).kind
-        if _AGENT_KINDS.get(agent, kind) != kind:
-            able = [other for other in AGENTS if _AGENT_KINDS.get(other, kind) == kind]
+        if kind not in kinds_of(agent):
+            able = [other for other in AGENTS if kind in kinds_of(other)]
             raise UsageError(
                 f"{upper(self.where)}: agent {agent!r} cannot play {task}, which has {_ACTIONS[kind]} actions: choose "
                 f"one of {', '.join(able)}."
