@@ -26,7 +26,7 @@ from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, field, fields, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, get_type_hints
 
 import gymnasium
 from filelock import FileLock, Timeout
@@ -156,6 +156,13 @@ def hyperparameters(algorithm: str, task: str, preset: str = "default", **change
         if name not in known:
             raise one_of(f"Hyperparameter of {algorithm}", name, known)
     return chosen.preset(preset, continuous=find_task(task).kind == "R", **changes)
+
+
+def kinds_of_hyperparameters(algorithm: str) -> dict[str, Any]:
+    """Type hint of every hyperparameter of an algorithm."""
+    args = ALGORITHMS[algorithm].args
+    hints = get_type_hints(args)
+    return {parameter.name: hints[parameter.name] for parameter in fields(args)}
 
 
 def find_limits(args: RunArgs) -> dict[str, float]:

@@ -266,7 +266,7 @@ class _Group:
         budget = self._setting("budget", None)
         if budget is not None:
             changes["total_timesteps"] = count(self.where, "budget", budget, 1)
-        preset = self._setting("preset", "default")
+        preset = text(self.where, {"preset": self._setting("preset", "default")}, "preset")
         validations = count(self.where, "validations", self._setting("validations", DEFAULT_VALIDATIONS), 1)
         return Training(algorithm, seed, preset, changes, validations)
 
@@ -284,14 +284,14 @@ class _Group:
             if isinstance(value, dict) and name not in runs.ALGORITHMS:
                 raise unknown(f"{upper(self.where)}: hyperparameters of", name, algorithms)
         for algorithm in algorithms:
-            known = {field.name: field for field in fields(runs.ALGORITHMS[algorithm].args)}
+            known = runs.kinds_of_hyperparameters(algorithm)
             for name, value in self._changes(algorithm).items():
                 if name in ("seed", "total_timesteps"):
                     key = {"seed": "seeds", "total_timesteps": "budget"}[name]
                     raise UsageError(f"{upper(self.where)}: {name} is no hyperparameter of a study: give {key}.")
                 if name not in known:
                     raise unknown(f"{upper(self.where)}: hyperparameter of {algorithm}", name, list(known))
-                check_kind(f"{self.where}, hyperparameter {name}", value, known[name].default)
+                check_kind(f"{self.where}, hyperparameter {name}", value, known[name])
 
     def _check_agent(self, agent: str, task: str) -> None:
         kind = find_task(task).kind

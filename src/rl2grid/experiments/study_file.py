@@ -6,7 +6,8 @@ import difflib
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from types import NoneType
+from typing import Any, get_args, get_origin
 
 from rl2grid.errors import UsageError
 
@@ -23,15 +24,39 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise UsageError(f"{path} is no TOML file: {error}.") from None
 
 
-def check_kind(what: str, value: Any, default: Any) -> None:
-    """Refuse a value that is not of the kind of the default (None says nothing about its kind)."""
-    numbers = (int, float)
-    if default is None or type(value) is type(default):
-        return
-    if isinstance(default, float) and isinstance(value, numbers) and not isinstance(value, bool):
-        return
-    kind = {bool: "true or false", int: "a whole number", float: "a number", tuple: "a list", str: "a text"}
-    raise UsageError(f"{upper(what)} must be {kind.get(type(default), type(default).__name__)}, not {value!r}.")
+def check_kind(what: str, value: Any, kind: Any) -> None:
+    """Refuse a value that is not of a kind.
+
+    Args:
+        what: what the value is of.
+        value: as TOML has it, or with tuples in place of lists.
+        kind: the type hint of a hyperparameter: bool, int, float, str, a tuple of one of them, or None as well.
+
+    Raises:
+        UsageError: what the value must be.
+    """
+    if not _is_of(value, kind):
+        raise UsageError(f"{upper(what)} must be {_description(kind)}, not {value!r}.")
+
+
+def _is_of(value: Any, kind: Any) -> bool:
+    entries = get_args(kind)
+    if get_origin(kind) is tuple:
+        return isinstance(value, tuple | list) and all(_is_of(entry, entries[0]) for entry in value)
+    if entries:
+        return any(_is_of(value, entry) for entry in entries)
+    if kind is float:
+        return type(value) in (int, float)
+    return type(value) is kind
+
+
+def _description(kind: Any) -> str:
+    entries = get_args(kind)
+    if get_origin(kind) is tuple:
+        return f"a list, each entry {_description(entries[0])}"
+    if entries:  # TOML has no None
+        return " or ".join(_description(entry) for entry in entries if entry is not NoneType)
+    return {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}[kind]
 
 
 def refuse_unknown_keys(where: str, table: Mapping[str, Any], allowed: Sequence[str]) -> None:
