@@ -82,6 +82,19 @@ def test_hyperparameters_are_those_of_all_then_those_of_one_algorithm():
         ({"group": {"hyperparameters": {"sac": {"tau": 1}}}}, "hyperparameters of sac, which it does not train"),
         ({"group": {"environment": {"dispatch": "best"}}}, "choose one of exact, grid2op"),
         ({"group": {"environment": {"reward": "best"}}}, "Reward 'best' does not exist"),
+        ({"group": {"algorithms": ["lagrangian-ppo"]}}, "Group 1: Lagrangian PPO needs a constraint"),
+        ({"group": {"tasks": ["bus14-T0-TLO"], "environment": {"constraint": "LSI"}}}, "constraint='LSI' contradicts"),
+        (
+            {
+                "group": {
+                    "algorithms": [],
+                    "agents": ["greedy"],
+                    "tasks": ["bus14-T0-TLO"],
+                    "environment": {"constraint": "LSI"},
+                }
+            },
+            "constraint='LSI' contradicts",
+        ),
         ({"group": {"budget": {"quick": 1}}}, "scale 'quick' does not exist"),
         ({"budget": 3}, "total_timesteps of at least"),
         ({"budget": "much"}, "budget must be a whole number of at least 1, not 'much'"),
@@ -111,6 +124,11 @@ def test_studies_accept_the_tasks_that_an_agent_can_play(agent: str, task: str):
                 parse_study(contents(group=group))
         else:
             assert len(parse_study(contents(group=group)).cells) == 1
+
+
+def test_the_keyword_constrains_a_task_without_a_constraint():
+    group = {"algorithms": ["lagrangian-ppo"], "environment": {"constraint": "LSI"}}
+    assert len(parse_study(contents(group=group)).cells) == 1
 
 
 @pytest.mark.parametrize("name", sorted(included_studies()))

@@ -26,6 +26,7 @@ SEARCH: dict[str, Any] = {"name": "search", "algorithm": "ppo", "task": "bus14-T
         ({"space": {"gamma": 0.9}}, "a list of choices or a range"),
         ({"space": {"gamma": {"low": 0.9, "high": 0.8}}}, "a list of choices or a range"),
         ({"space": {}}, "at least one hyperparameter"),
+        ({"algorithm": "lagrangian-ppo", "space": {"gamma": [0.9]}}, "Lagrangian PPO needs a constraint"),
         ({"budget": 10}, "total_timesteps of at least"),
     ],
 )

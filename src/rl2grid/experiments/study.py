@@ -31,7 +31,7 @@ from typing import Any
 
 from rl2grid.analysis.sources import CELLS_FOLDER
 from rl2grid.engines import HEURISTICS
-from rl2grid.envs.tasks import TaskOptions, find_task
+from rl2grid.envs.tasks import TaskOptions, constraint_of, find_task
 from rl2grid.errors import UsageError
 from rl2grid.experiments import runs
 from rl2grid.experiments.agents import AGENTS, kinds_of
@@ -232,12 +232,7 @@ class _Group:
                 self._check_agent(agent, task)
                 yield self._cell(agent, task, heuristic, None)
             for algorithm, seed in itertools.product(algorithms, self._seeds() if algorithms else ()):
-                training = self._training(algorithm, seed)
-                try:
-                    training.resolved(task)
-                except UsageError as error:
-                    raise UsageError(f"{upper(self.where)}: {error}") from None
-                yield self._cell(algorithm, task, heuristic, training)
+                yield self._cell(algorithm, task, heuristic, self._training(algorithm, seed))
 
     def _cell(self, agent: str, task: str, heuristic: str, training: Training | None) -> Cell:
         label = text(self.where, self.table, "label", "")
@@ -249,7 +244,7 @@ class _Group:
         if split not in SPLITS:
             raise unknown(f"{upper(self.where)}: split", split, SPLITS)
         months = self._setting("months", None)
-        return Cell(
+        cell = Cell(
             name="-".join(part for part in parts if part),
             agent=agent,
             task=task,
@@ -260,6 +255,11 @@ class _Group:
             evaluation_seeds=count(self.where, "evaluation_seeds", self._setting("evaluation_seeds", 1), 1),
             training=training,
         )
+        try:
+            _check_training_and_constraint(cell)
+        except UsageError as error:
+            raise UsageError(f"{upper(self.where)}: {error}") from None
+        return cell
 
     def _training(self, algorithm: str, seed: int) -> Training:
         changes = self._changes(algorithm)
@@ -345,6 +345,15 @@ class _Group:
 
 
 _GIVEN_OTHERWISE = ("heuristic", "split", "scenario", "gamma")
+
+
+def _check_training_and_constraint(cell: Cell) -> None:
+    """Refuse hyperparameters that cannot work, or not under the constraint of the cell."""
+    if cell.training is None:
+        constraint_of(find_task(cell.task), cell.environment.get("constraint"))
+        return
+    hyperparameters, algorithm = cell.training.resolved(cell.task), cell.training.algorithm
+    runs.find_limits(runs.RunArgs(cell.task, hyperparameters, algorithm, env_keywords=cell.environment))
 
 
 def _chosen_scale(scales: Mapping[str, Any], asked: str | None) -> str | None:

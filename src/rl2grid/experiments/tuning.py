@@ -162,7 +162,7 @@ def parse_tuning(contents: Mapping[str, Any], output: Path | None = None) -> Tun
         space=space,
     )
     _check_space(tuning)
-    tuning.resolved({})
+    runs.find_limits(_run_args(tuning, tuning.resolved({}), None))  # refuses what cannot be constrained
     return tuning
 
 
