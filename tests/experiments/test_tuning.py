@@ -11,6 +11,7 @@ import pytest
 
 import rl2grid
 from rl2grid.errors import UsageError
+from rl2grid.experiments.runs import ALGORITHMS
 from rl2grid.experiments.tuning import Reports, best_command, one_score, parse_tuning, run_tuning
 
 SOURCES = str(Path(rl2grid.__file__).parents[1])
@@ -27,6 +28,18 @@ SEARCH: dict[str, Any] = {"name": "search", "algorithm": "ppo", "task": "bus14-T
         ({"space": {"gamma": {"low": 0.9, "high": 0.8}}}, "a list of choices or a range"),
         ({"space": {}}, "at least one hyperparameter"),
         ({"algorithm": "lagrangian-ppo", "space": {"gamma": [0.9]}}, "Lagrangian PPO needs a constraint"),
+        ({"hyperparameters": {"initial_do_nothing": "x"}}, "initial_do_nothing must be a number, not 'x'"),
+        ({"hyperparameters": {"gamma": 0.9}, "space": {"gamma": [0.8]}}, "gamma is both fixed, in [hyperparameters]"),
+        ({"hyperparameters": {"num_steps": 8}, "space": {"num_envs * num_steps": [64]}}, "in two ways"),
+        ({"space": {"gamma": ["x"]}}, "Each choice for gamma must be a number, not 'x'"),
+        ({"space": {"gamma": [0.9, 1.1]}}, "The space of gamma holds 1.1, which cannot work"),
+        ({"space": {"num_steps": {"low": 1, "high": 10_000}}}, "The space of num_steps holds 10000"),
+        ({"space": {"num_envs": {"low": 1.5, "high": 2.5}}}, "Each choice for num_envs must be a whole number"),
+        ({"space": {"actor_layers": [8, 8]}}, "Each choice for actor_layers must be a list"),
+        (
+            {"algorithm": "lagrangian-ppo", "task": "bus14-T0-TLO", "space": {"thresholds": [[0.0], [50.0]]}},
+            "The thresholds cannot be searched",
+        ),
         ({"budget": 10}, "total_timesteps of at least"),
     ],
 )
@@ -34,6 +47,27 @@ def test_a_bad_search_is_refused_in_one_sentence(changes: dict[str, Any], part: 
     with pytest.raises(UsageError) as refusal:
         parse_tuning({**SEARCH, **changes})
     assert part in str(refusal.value)
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_every_choice_of_every_default_space_can_be_trained(algorithm: str):
+    task = "bus14-T0-TLO" if "T" in ALGORITHMS[algorithm].kinds else "bus14-R"
+    tuning = parse_tuning({**SEARCH, "algorithm": algorithm, "task": task, "budget": 100_000})
+    for name, values in tuning.space.items():
+        for value in values:
+            assert tuning.resolved({name: value}).total_timesteps == 100_000
+
+
+def test_a_choice_that_works_beside_some_others_only_is_kept():
+    space = {"num_envs": [1, 16], "num_steps": [32, 256]}
+    assert parse_tuning({**SEARCH, "space": space}).space == space
+
+
+def test_what_is_fixed_is_not_searched_by_default():
+    tuning = parse_tuning({**SEARCH, "budget": 100_000, "hyperparameters": {"gamma": 0.9, "num_steps": 8}})
+    assert not {"gamma", "num_steps", "num_envs * num_steps"} & set(tuning.space)
+    assert "num_envs" in tuning.space
+    assert tuning.resolved({}).num_steps == 8
 
 
 def test_transitions_per_update_become_steps():

@@ -286,10 +286,10 @@ SEARCH_SPACE: dict[str, tuple[float, ...]] = {
     "actor_learning_rate": (3e-3, 3e-4, 3e-5),
     "critic_learning_rate": (3e-3, 3e-4, 3e-5),
     "clip_coefficient": (0.1, 0.2, 0.3),
-    "thresholds": (0.0, 50.0),
 }
 """The values among which the paper searched (its table of hyperparameters); it tells transitions per update, not steps.
-The table gives the threshold 0 to TLO and 50 to LSI, the text the other way round: the tasks follow the text.
+The thresholds 0 and 50 that the table lists as well are no choice but what a task asks for. The table gives 0 to TLO
+and 50 to LSI, the text the other way round: the tasks follow the text.
 The weights of the reward, which it searched as well, belong to the environment."""
 
 

@@ -18,11 +18,12 @@ import hashlib
 import json
 import math
 import os
+import random
 import sys
 import time
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -42,7 +43,7 @@ from rl2grid.experiments.commands import train_command
 from rl2grid.experiments.interrupts import stop_requests
 from rl2grid.experiments.study import NO_HEURISTIC
 from rl2grid.experiments.study_cell import STOPPED, CellProcess, is_busy, serve
-from rl2grid.experiments.study_file import as_table, count, read_toml, refuse_unknown_keys, text, unknown
+from rl2grid.experiments.study_file import as_table, check_kind, count, read_toml, refuse_unknown_keys, text, unknown
 from rl2grid.experiments.validation import validator
 
 TUNING_FILE, JOURNAL_FILE, BEST_FILE = "tuning.json", "journal.log", "best.json"
@@ -51,6 +52,10 @@ COMMAND: tuple[str, ...] = (sys.executable, "-m", "rl2grid.experiments.tuning")
 
 TRANSITIONS = "num_envs * num_steps"
 """Name of a parameter that the paper searched in place of ``num_steps``."""
+_MEASURES = ("constraints", "thresholds")
+"""Hyperparameters by which runs are scored."""
+_COMBINATIONS = 1_000
+"""Of other choices, beside which a choice is tried before it is refused."""
 _KEYS = (
     "name",
     "output",
@@ -144,7 +149,8 @@ def parse_tuning(contents: Mapping[str, Any], output: Path | None = None) -> Tun
         raise unknown("Heuristic", heuristic, (NO_HEURISTIC, *HEURISTICS))
     if algorithm not in runs.ALGORITHMS:
         raise unknown("Algorithm", algorithm, tuple(runs.ALGORITHMS))
-    space = as_table("the search, space", contents.get("space", search_space(algorithm)))
+    hyperparameters = as_table("the search, hyperparameters", contents.get("hyperparameters", {}))
+    space = as_table("the search, space", contents.get("space", _default_space(algorithm, hyperparameters)))
     months = contents.get("months")
     tuning = Tuning(
         name=name,
@@ -158,11 +164,14 @@ def parse_tuning(contents: Mapping[str, Any], output: Path | None = None) -> Tun
         budget=count(where, "budget", contents.get("budget", 200_000), 1),
         validations=count(where, "validations", contents.get("validations", 10), 1),
         months=None if months is None else count(where, "months", months, 1),
-        hyperparameters=as_table("the search, hyperparameters", contents.get("hyperparameters", {})),
+        hyperparameters=hyperparameters,
         space=space,
     )
     _check_space(tuning)
-    runs.find_limits(_run_args(tuning, tuning.resolved({}), None))  # refuses what cannot be constrained
+    refusal = _refusal(tuning, {})
+    if refusal is not None:
+        raise refusal
+    _check_choices(tuning)
     return tuning
 
 
@@ -170,6 +179,12 @@ def search_space(algorithm: str) -> dict[str, list[Any]]:
     """The paper's grid for an algorithm (its table of hyperparameters)."""
     module = import_module(runs.ALGORITHMS[algorithm].args.__module__)
     return {name: list(values) for name, values in module.SEARCH_SPACE.items()}
+
+
+def _default_space(algorithm: str, fixed: Mapping[str, Any]) -> dict[str, list[Any]]:
+    """The paper's grid without what is fixed."""
+    without = {*fixed, TRANSITIONS} if "num_steps" in fixed else set(fixed)
+    return {name: values for name, values in search_space(algorithm).items() if name not in without}
 
 
 def run_tuning(
@@ -403,18 +418,65 @@ def _prepare(tuning: Tuning) -> None:
 def _check_space(tuning: Tuning) -> None:
     if not tuning.space:
         raise UsageError("A search needs a [space] with at least one hyperparameter, such as gamma = [0.9, 0.99].")
-    known = [field.name for field in fields(runs.ALGORITHMS[tuning.algorithm].args)] + [TRANSITIONS]
-    for name, values in {**tuning.space, **tuning.hyperparameters}.items():
-        if name not in known or name in ("seed", "total_timesteps"):
-            allowed = [each for each in known if each not in ("seed", "total_timesteps")]
+    kinds = {**runs.kinds_of_hyperparameters(tuning.algorithm), TRANSITIONS: int}
+    allowed = [name for name in kinds if name not in ("seed", "total_timesteps")]
+    for name in (*tuning.space, *tuning.hyperparameters):
+        if name not in allowed:
             raise unknown(f"Hyperparameter of {tuning.algorithm}", name, allowed)
-        if name not in tuning.space or (isinstance(values, list) and values):
-            continue
-        if not _is_range(values):
+        if name in tuning.space and name in tuning.hyperparameters:
             raise UsageError(
-                f"The space of {name} must be a list of choices or a range {{low = 0.1, high = 1.0, log = true}}, "
-                f"not {values!r}."
+                f"{name} is both fixed, in [hyperparameters], and searched, in [space]: take it out of one."
             )
+    if {"num_steps", TRANSITIONS} <= {*tuning.space, *tuning.hyperparameters}:
+        raise UsageError(f"num_steps and {TRANSITIONS!r} say the same in two ways: take one of them out.")
+    for name, value in tuning.hyperparameters.items():
+        check_kind(f"the search, hyperparameter {name}", value, kinds[name])
+    for name, values in tuning.space.items():
+        if name in _MEASURES:
+            raise UsageError(
+                f"The {name} cannot be searched, because all trials are scored by the same: fix them in "
+                "[hyperparameters]."
+            )
+        for choice in _choices(name, values):
+            check_kind(f"each choice for {name}", choice, kinds[name])
+
+
+def _choices(name: str, values: Any) -> list[Any]:
+    """All choices; of a range its ends."""
+    if isinstance(values, list) and values:
+        return values
+    if _is_range(values):
+        return [values["low"], values["high"]]
+    raise UsageError(
+        f"The space of {name} must be a list of choices or a range {{low = 0.1, high = 1.0, log = true}}, "
+        f"not {values!r}."
+    )
+
+
+def _check_choices(tuning: Tuning) -> None:
+    """Refuse a choice that cannot work beside any of many combinations of the others."""
+    draw = random.Random(0)
+    choices = {name: _choices(name, values) for name, values in tuning.space.items()}
+    for name, values in choices.items():
+        for choice in values:
+            refusal = _refusal(tuning, {name: choice})
+            if refusal is None:
+                continue
+            combinations = (
+                {**{other: draw.choice(each) for other, each in choices.items()}, name: choice}
+                for _ in range(_COMBINATIONS)
+            )
+            if all(_refusal(tuning, combination) for combination in combinations):
+                raise UsageError(f"The space of {name} holds {choice!r}, which cannot work: {refusal}")
+
+
+def _refusal(tuning: Tuning, chosen: Mapping[str, Any]) -> UsageError | None:
+    """Why a configuration cannot be trained; None if it can."""
+    try:
+        runs.find_limits(_run_args(tuning, tuning.resolved(chosen), None))
+    except UsageError as error:
+        return error
+    return None
 
 
 def _is_range(values: Any) -> bool:
