@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,7 @@ import pytest
 import rl2grid
 from rl2grid.errors import UsageError
 from rl2grid.experiments.runs import ALGORITHMS
-from rl2grid.experiments.tuning import Reports, best_command, one_score, parse_tuning, run_tuning
+from rl2grid.experiments.tuning import Reports, _begin, _open, best_command, one_score, parse_tuning, run_tuning
 
 SOURCES = str(Path(rl2grid.__file__).parents[1])
 SEARCH: dict[str, Any] = {"name": "search", "algorithm": "ppo", "task": "bus14-T0", "budget": 512, "trials": 2}
@@ -74,6 +76,22 @@ def test_transitions_per_update_become_steps():
     tuning = parse_tuning({**SEARCH, "budget": 100_000})
     assert tuning.space["num_envs * num_steps"] == [10_000, 20_000, 50_000]
     assert tuning.resolved({"num_envs": 50, "num_envs * num_steps": 20_000}).num_steps == 400
+
+
+def test_processes_that_begin_at_the_same_time_begin_no_more_trials_than_asked_for(tmp_path: Path, monkeypatch):
+    optuna = pytest.importorskip("optuna")
+    tuning = parse_tuning({**SEARCH, "space": {"gamma": {"low": 0.5, "high": 0.9}}}, tmp_path)
+    ask = optuna.study.Study.ask
+
+    def slowly(study: Any) -> Any:
+        time.sleep(0.2)
+        return ask(study)
+
+    monkeypatch.setattr(optuna.study.Study, "ask", slowly)
+    _open(tuning)
+    with ThreadPoolExecutor(4) as pool:
+        begun = list(pool.map(lambda _: _begin(tuning, _open(tuning)), range(4)))
+    assert sum(each is not None for each in begun) == tuning.trials == 2
 
 
 @pytest.mark.slow

@@ -243,23 +243,31 @@ def work(folder: Path) -> None:
     stored = json.loads((folder / TUNING_FILE).read_text(encoding="utf-8"))
     tuning = Tuning(**stored, output=folder)
     study = _open(tuning)
-    ended = (optuna.trial.TrialState.COMPLETE, optuna.trial.TrialState.PRUNED)
-    # All that are under way count, so that parallel processes do not begin more than asked for.
-    begun = (*ended, optuna.trial.TrialState.RUNNING)
-    while sum(trial.state in begun for trial in study.get_trials(deepcopy=False)) < tuning.trials:
-        trial = study.ask()
+    while (begun := _begin(tuning, study)) is not None:
+        trial, chosen = begun
         try:
-            reached = _train(tuning, trial)
+            reached = _train(tuning, trial, chosen)
         except optuna.TrialPruned:
             study.tell(trial, state=optuna.trial.TrialState.PRUNED)
         else:
             study.tell(trial, reached)
 
 
-def _train(tuning: Tuning, trial: Any) -> float:
+def _begin(tuning: Tuning, study: Any) -> tuple[Any, dict[str, Any]] | None:
+    """Begin a trial; returns it and its choices, None if there are enough trials."""
+    states = _optuna().trial.TrialState
+    # All that are under way count, so that parallel processes do not begin more than asked for.
+    counted = (states.COMPLETE, states.PRUNED, states.RUNNING)
+    with FileLock(tuning.output / ".begin.lock"):
+        if sum(trial.state in counted for trial in study.get_trials(deepcopy=False)) >= tuning.trials:
+            return None
+        trial = study.ask()
+        return trial, {name: _suggest(trial, name, values) for name, values in tuning.space.items()}
+
+
+def _train(tuning: Tuning, trial: Any, chosen: Mapping[str, Any]) -> float:
     """Train one configuration; returns its best score in validation."""
     optuna = _optuna()
-    chosen = {name: _suggest(trial, name, values) for name, values in tuning.space.items()}
     try:
         hyperparameters = tuning.resolved(chosen)
     except UsageError as error:
