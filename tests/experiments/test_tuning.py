@@ -14,7 +14,17 @@ import pytest
 import rl2grid
 from rl2grid.errors import UsageError
 from rl2grid.experiments.runs import ALGORITHMS
-from rl2grid.experiments.tuning import Reports, _begin, _open, best_command, one_score, parse_tuning, run_tuning
+from rl2grid.experiments.tuning import (
+    Reports,
+    Tuning,
+    _begin,
+    _open,
+    _put_back_interrupted,
+    best_command,
+    one_score,
+    parse_tuning,
+    run_tuning,
+)
 
 SOURCES = str(Path(rl2grid.__file__).parents[1])
 SEARCH: dict[str, Any] = {"name": "search", "algorithm": "ppo", "task": "bus14-T0", "budget": 512, "trials": 2}
@@ -92,6 +102,34 @@ def test_processes_that_begin_at_the_same_time_begin_no_more_trials_than_asked_f
     with ThreadPoolExecutor(4) as pool:
         begun = list(pool.map(lambda _: _begin(tuning, _open(tuning)), range(4)))
     assert sum(each is not None for each in begun) == tuning.trials == 2
+    assert len({each[1]["gamma"] for each in begun if each}) == 2
+
+
+def search_by_formula(tuning: Tuning, interrupted_at: int | None) -> list[dict[str, Any]]:
+    """What one process chooses, if gamma itself is what is reached."""
+    tuning.output.mkdir()
+    chosen: list[dict[str, Any]] = []
+    study = _open(tuning)
+    while (begun := _begin(tuning, study)) is not None:
+        trial, choices = begun
+        if len(chosen) == interrupted_at:
+            interrupted_at = None
+            _put_back_interrupted(tuning)
+            study = _open(tuning)
+            continue
+        study.tell(trial, choices["gamma"])
+        chosen.append(choices)
+    return chosen
+
+
+def test_one_process_chooses_by_the_seed_alone_interrupted_or_not(tmp_path: Path):
+    pytest.importorskip("optuna")
+    file = {**SEARCH, "trials": 13, "space": {"gamma": {"low": 0.5, "high": 0.9}, "num_envs": [1, 2, 4]}}
+    straight = search_by_formula(parse_tuning(file, tmp_path / "straight"), None)
+    assert len({choices["gamma"] for choices in straight}) == 13
+    for place in (4, 11):
+        assert search_by_formula(parse_tuning(file, tmp_path / f"killed {place}"), place) == straight
+    assert search_by_formula(parse_tuning({**file, "seed": 2}, tmp_path / "other"), None) != straight
 
 
 @pytest.mark.slow

@@ -28,6 +28,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from filelock import FileLock, Timeout
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
@@ -84,7 +85,8 @@ class Tuning:
     heuristic: str | None
     preset: str
     seed: int
-    """Of the trainings and of the search."""
+    """Of the trainings and of the search. One process at a time chooses the same configurations again, interrupted or
+    not; with several, the choice depends as well on which trials have ended by then."""
     trials: int
     budget: int
     """Decisions of a training."""
@@ -259,8 +261,11 @@ def _begin(tuning: Tuning, study: Any) -> tuple[Any, dict[str, Any]] | None:
     # All that are under way count, so that parallel processes do not begin more than asked for.
     counted = (states.COMPLETE, states.PRUNED, states.RUNNING)
     with FileLock(tuning.output / ".begin.lock"):
-        if sum(trial.state in counted for trial in study.get_trials(deepcopy=False)) >= tuning.trials:
+        number = sum(trial.state in counted for trial in study.get_trials(deepcopy=False))
+        if number >= tuning.trials:
             return None
+        # A seed for every trial: neither do parallel processes draw the same, nor does one that goes on draw it again.
+        study.sampler = _sampler(np.random.SeedSequence((tuning.seed, number)).generate_state(1).item())
         trial = study.ask()
         return trial, {name: _suggest(trial, name, values) for name, values in tuning.space.items()}
 
@@ -372,10 +377,13 @@ def _open(tuning: Tuning) -> Any:
         study_name=tuning.name,
         direction="maximize",
         load_if_exists=True,
-        # Processes that sample at the same time must not sample the same.
-        sampler=optuna.samplers.TPESampler(constant_liar=True),
         pruner=optuna.pruners.MedianPruner(n_startup_trials=5, n_warmup_steps=tuning.budget // 5),
     )
+
+
+def _sampler(seed: int) -> Any:
+    # Processes that sample at the same time must not sample the same.
+    return _optuna().samplers.TPESampler(constant_liar=True, seed=seed)
 
 
 def _put_back_interrupted(tuning: Tuning) -> None:
