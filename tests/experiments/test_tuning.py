@@ -7,23 +7,28 @@ import os
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 import rl2grid
 from rl2grid.errors import UsageError
+from rl2grid.experiments import runs
+from rl2grid.experiments import tuning as tuning_module
 from rl2grid.experiments.runs import ALGORITHMS
 from rl2grid.experiments.tuning import (
     Reports,
     Tuning,
     _begin,
     _open,
+    _prepare,
     _put_back_interrupted,
     best_command,
     one_score,
     parse_tuning,
     run_tuning,
+    work,
 )
 
 SOURCES = str(Path(rl2grid.__file__).parents[1])
@@ -130,6 +135,36 @@ def test_one_process_chooses_by_the_seed_alone_interrupted_or_not(tmp_path: Path
     for place in (4, 11):
         assert search_by_formula(parse_tuning(file, tmp_path / f"killed {place}"), place) == straight
     assert search_by_formula(parse_tuning({**file, "seed": 2}, tmp_path / "other"), None) != straight
+
+
+@pytest.mark.parametrize(("prune", "state"), [(False, "COMPLETE"), (True, "PRUNED")])
+def test_of_equal_trials_one_is_trained_and_the_others_take_its_result(
+    tmp_path: Path, monkeypatch, prune: bool, state: str
+):
+    optuna = pytest.importorskip("optuna")
+    trained: list[Path] = []
+
+    def train(args: runs.RunArgs, *, evaluate: Any) -> None:
+        assert args.folder is not None
+        args.folder.mkdir(parents=True)
+        trained.append(args.folder)
+        time.sleep(0.5)
+        evaluate(SimpleNamespace(identity={"decisions": 256}))
+        (args.folder / "metrics.csv").write_text(
+            "step,grid_steps,wall_time,name,value\n256,0,0.0,validation/survival,0.5\n"
+        )
+
+    monkeypatch.setattr(runs, "train", train)
+    monkeypatch.setattr(runs, "is_finished", lambda folder: (folder / "metrics.csv").exists())
+    monkeypatch.setattr(tuning_module, "validator", lambda args: lambda agent: {"survival": 0.5})
+    monkeypatch.setattr(optuna.trial.Trial, "should_prune", lambda self: prune)
+    tuning = parse_tuning({**SEARCH, "trials": 3, "space": {"gamma": [0.9]}}, tmp_path)
+    _prepare(tuning)
+    _open(tuning)
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(work, [tmp_path, tmp_path]))
+    assert len(trained) == 1
+    assert [trial.state.name for trial in _open(tuning).get_trials()] == [state] * 3
 
 
 @pytest.mark.slow

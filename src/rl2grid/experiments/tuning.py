@@ -245,14 +245,18 @@ def work(folder: Path) -> None:
     stored = json.loads((folder / TUNING_FILE).read_text(encoding="utf-8"))
     tuning = Tuning(**stored, output=folder)
     study = _open(tuning)
+    locks = folder / ".locks"
+    locks.mkdir(exist_ok=True)
     while (begun := _begin(tuning, study)) is not None:
         trial, chosen = begun
-        try:
-            reached = _train(tuning, trial, chosen)
-        except optuna.TrialPruned:
-            study.tell(trial, state=optuna.trial.TrialState.PRUNED)
-        else:
-            study.tell(trial, reached)
+        # Of equal trials one trains; the others wait until it is told, and take what it reached.
+        with FileLock(locks / _trial_folder(tuning, chosen).name):
+            try:
+                reached = _train(tuning, trial, chosen)
+            except optuna.TrialPruned:
+                study.tell(trial, state=optuna.trial.TrialState.PRUNED)
+            else:
+                study.tell(trial, reached)
 
 
 def _begin(tuning: Tuning, study: Any) -> tuple[Any, dict[str, Any]] | None:
@@ -283,6 +287,8 @@ def _train(tuning: Tuning, trial: Any, chosen: Mapping[str, Any]) -> float:
     args = _run_args(tuning, hyperparameters, folder)
     validate = validator(args)
     reports = Reports(trial, folder, runs.find_limits(args))
+    if _was_pruned(trial.study, folder):
+        raise optuna.TrialPruned
 
     def report(agent: PolicyAgent) -> Mapping[str, float]:
         result = validate(agent)
@@ -296,6 +302,12 @@ def _train(tuning: Tuning, trial: Any, chosen: Mapping[str, Any]) -> float:
     if not runs.is_finished(folder):
         raise KeyboardInterrupt
     return reports.best
+
+
+def _was_pruned(study: Any, folder: Path) -> bool:
+    """Whether a trial with this run was ended early."""
+    pruned = study.get_trials(deepcopy=False, states=[_optuna().trial.TrialState.PRUNED])
+    return any(trial.user_attrs.get("run") == folder.name for trial in pruned)
 
 
 def _run_args(tuning: Tuning, hyperparameters: runs.Hyperparameters, folder: Path | None) -> runs.RunArgs:
