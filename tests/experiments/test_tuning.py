@@ -184,6 +184,27 @@ def test_a_search_finds_the_best_of_its_trials_and_is_gone_on_with(tmp_path: Pat
     assert set((tmp_path / "trials").iterdir()) == runs
 
 
+@pytest.mark.slow
+def test_a_poor_trial_is_ended_by_its_validation_survival(tmp_path: Path, monkeypatch):
+    pytest.importorskip("optuna")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([SOURCES, os.environ.get("PYTHONPATH", "")]))
+    cautious, rash = 0.99, 0.001
+    file = {**SEARCH, "trials": 6, "months": 1, "validations": 2, "space": {"initial_do_nothing": [cautious, rash]}}
+    tuning = parse_tuning({**file, "hyperparameters": {"actor_learning_rate": 1e-6}}, tmp_path)
+    # Nothing is ended before five trials are complete; equal ones cost one training.
+    for choice in (*[cautious] * 5, rash):
+        _open(tuning).enqueue_trial({"initial_do_nothing": choice})
+    best = run_tuning(tuning, 1)
+    assert best is not None
+    assert best.hyperparameters == {"initial_do_nothing": cautious}
+    *complete, pruned = _open(tuning).get_trials()
+    assert [trial.state.name for trial in (*complete, pruned)] == ["COMPLETE"] * 5 + ["PRUNED"]
+    assert list(pruned.intermediate_values) == [256], "it was ended half way"
+    assert pruned.user_attrs["survival"] < best.survival
+    metrics = tmp_path / "trials" / pruned.user_attrs["run"] / "metrics.csv"
+    assert not any(line.startswith("512,") for line in metrics.read_text().splitlines())
+
+
 def test_searches_under_constraints_look_for_safety_before_survival():
     limits = {"TLO": 50.0}
     ranked = [(0.5, 0.2), (0.5, 0.9), (0.55, 0.1), (1.0, 1.0)]
