@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -203,6 +204,30 @@ def test_a_poor_trial_is_ended_by_its_validation_survival(tmp_path: Path, monkey
     assert pruned.user_attrs["survival"] < best.survival
     metrics = tmp_path / "trials" / pruned.user_attrs["run"] / "metrics.csv"
     assert not any(line.startswith("512,") for line in metrics.read_text().splitlines())
+
+
+ONE_TRIAL_AND_A_CRASH = """
+import json, sys
+from pathlib import Path
+from rl2grid.experiments.tuning import Tuning, _begin, _open
+folder = Path(sys.argv[1])
+tuning = Tuning(**json.loads((folder / "tuning.json").read_text()), output=folder)
+study = _open(tuning)
+trial, _ = _begin(tuning, study)
+trial.set_user_attr("survival", 0.5)
+study.tell(trial, 0.5)
+_begin(tuning, study)
+"""
+
+
+@pytest.mark.slow
+def test_a_search_that_ends_short_of_trials_says_so(tmp_path: Path, monkeypatch):
+    pytest.importorskip("optuna")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([SOURCES, os.environ.get("PYTHONPATH", "")]))
+    tuning = parse_tuning({**SEARCH, "space": {"gamma": [0.9, 0.99]}}, tmp_path)
+    with pytest.raises(UsageError, match="stopped after 1 of 2 trials"):
+        run_tuning(tuning, 1, command=(sys.executable, "-c", ONE_TRIAL_AND_A_CRASH))
+    assert json.loads((tmp_path / "best.json").read_text())["survival"] == 0.5
 
 
 def test_searches_under_constraints_look_for_safety_before_survival():

@@ -204,7 +204,7 @@ def run_tuning(
         The best configuration so far; None when an interrupt asked to stop.
 
     Raises:
-        UsageError: Optuna is missing, the folder holds another search, or no trial could be trained.
+        UsageError: Optuna is missing, the folder holds another search, or not all trials could be trained.
     """
     _optuna()
     if jobs is not None and jobs < 1:
@@ -228,6 +228,12 @@ def run_tuning(
     if best is None or all(status not in (0, STOPPED) for status in statuses):
         raise UsageError(f"The search failed: {tuning.output / 'log.txt'} says why.")
     write_json(tuning.output / BEST_FILE, asdict(best) | {"command": best_command(tuning, best)})
+    ended = len(_ended(_open(tuning)))
+    if ended < tuning.trials:
+        raise UsageError(
+            f"The search stopped after {ended} of {tuning.trials} trials: {tuning.output / 'log.txt'} says why, and "
+            "the same command goes on."
+        )
     return best
 
 
@@ -412,6 +418,13 @@ def _put_back_interrupted(tuning: Tuning) -> None:
                 study.enqueue_trial(trial.params)
 
 
+def _ended(study: Any) -> list[Any]:
+    """The trials that count: complete, or ended because they were poor."""
+    states = _optuna().trial.TrialState
+    ended: list[Any] = study.get_trials(deepcopy=False, states=[states.COMPLETE, states.PRUNED])
+    return ended
+
+
 def _best(tuning: Tuning) -> Best | None:
     study, state = _open(tuning), _optuna().trial.TrialState.COMPLETE
     done = [trial for trial in study.get_trials(deepcopy=False) if trial.state == state]
@@ -551,8 +564,7 @@ def _progress(tuning: Tuning, console: Console | None) -> Iterator[Any]:
         began = time.monotonic()
 
         def show(study: Any) -> None:
-            trials = study.get_trials(deepcopy=False)
-            ended = [trial for trial in trials if trial.state.name in ("COMPLETE", "PRUNED")]
+            ended = _ended(study)
             best_so_far = _best(tuning)
             best = f"best survival {best_so_far.survival:.3f}, " if best_so_far else ""
             pruned = sum(trial.state.name == "PRUNED" for trial in ended)
