@@ -111,6 +111,16 @@ def test_processes_that_begin_at_the_same_time_begin_no_more_trials_than_asked_f
     assert len({each[1]["gamma"] for each in begun if each}) == 2
 
 
+def test_a_range_of_numbers_may_end_at_whole_numbers(tmp_path: Path):
+    pytest.importorskip("optuna")
+    space = {"gae_lambda": {"low": 0, "high": 1}, "num_envs": {"low": 1, "high": 4}}
+    tuning = parse_tuning({**SEARCH, "space": space}, tmp_path)
+    begun = _begin(tuning, _open(tuning))
+    assert begun is not None
+    assert 0.0 < begun[1]["gae_lambda"] < 1.0
+    assert begun[1]["num_envs"] in (1, 2, 3, 4)
+
+
 def search_by_formula(tuning: Tuning, interrupted_at: int | None) -> list[dict[str, Any]]:
     """What one process chooses, if gamma itself is what is reached."""
     tuning.output.mkdir()

@@ -277,7 +277,8 @@ def _begin(tuning: Tuning, study: Any) -> tuple[Any, dict[str, Any]] | None:
         # A seed for every trial: neither do parallel processes draw the same, nor does one that goes on draw it again.
         study.sampler = _sampler(np.random.SeedSequence((tuning.seed, number)).generate_state(1).item())
         trial = study.ask()
-        return trial, {name: _suggest(trial, name, values) for name, values in tuning.space.items()}
+        kinds = _kinds(tuning)
+        return trial, {name: _suggest(trial, name, values, kinds[name]) for name, values in tuning.space.items()}
 
 
 def _train(tuning: Tuning, trial: Any, chosen: Mapping[str, Any]) -> float:
@@ -372,14 +373,14 @@ def one_score(means: Mapping[str, float], limits: Mapping[str, float]) -> float:
     return first + sum(1e-3 * value for value in then)
 
 
-def _suggest(trial: Any, name: str, values: Any) -> Any:
+def _suggest(trial: Any, name: str, values: Any, kind: Any) -> Any:
     if isinstance(values, list):
         # A journal keeps no lists: layers are chosen by their number in the file.
         if any(isinstance(value, list) for value in values):
             return values[trial.suggest_categorical(f"number of {name}", tuple(range(len(values))))]
         return trial.suggest_categorical(name, tuple(values))
     low, high, log = values["low"], values["high"], values.get("log", False)
-    if isinstance(low, int) and isinstance(high, int):
+    if kind is int:
         return trial.suggest_int(name, low, high, log=log)
     return trial.suggest_float(name, low, high, log=log)
 
@@ -459,7 +460,7 @@ def _prepare(tuning: Tuning) -> None:
 def _check_space(tuning: Tuning) -> None:
     if not tuning.space:
         raise UsageError("A search needs a [space] with at least one hyperparameter, such as gamma = [0.9, 0.99].")
-    kinds = {**runs.kinds_of_hyperparameters(tuning.algorithm), TRANSITIONS: int}
+    kinds = _kinds(tuning)
     allowed = [name for name in kinds if name not in ("seed", "total_timesteps")]
     for name in (*tuning.space, *tuning.hyperparameters):
         if name not in allowed:
@@ -480,6 +481,11 @@ def _check_space(tuning: Tuning) -> None:
             )
         for choice in _choices(name, values):
             check_kind(f"each choice for {name}", choice, kinds[name])
+
+
+def _kinds(tuning: Tuning) -> dict[str, Any]:
+    """Type hint of every name that a search may hold."""
+    return {**runs.kinds_of_hyperparameters(tuning.algorithm), TRANSITIONS: int}
 
 
 def _choices(name: str, values: Any) -> list[Any]:
