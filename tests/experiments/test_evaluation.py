@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -211,6 +212,31 @@ def test_two_writers_do_not_mix(tmp_path):
 
     jobs = [Job("doomed", 0, 0), Job("april", 0, 0)]
     play(Second(), jobs, output=tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("identity", "sentence"),
+    [
+        ({**IDENTITY, "agent": "another"}, "holds another evaluation, with a different agent"),
+        (IDENTITY, "Another process wrote this evaluation to .* meanwhile"),
+    ],
+)
+@pytest.mark.parametrize("fail_on", ["may", None])
+def test_a_folder_that_was_written_meanwhile_is_not_mixed(tmp_path, identity, sentence, fail_on):
+    """Both begin before there is a folder; the other one ends, or breaks off, before this one has a row."""
+    out = tmp_path / "out"
+
+    class Slower(DoNothing):
+        def act(self, observation, info):
+            if not out.exists():
+                with contextlib.suppress(ValueError):
+                    play(output=out, fail_on=fail_on)
+            return 1
+
+    with pytest.raises(UsageError, match=sentence):
+        play(Slower(), output=out, identity=identity)
+    result = play(output=out)
+    assert without_times(result.episodes) == without_times(play().episodes)
 
 
 @pytest.mark.parametrize("workers", [0, 1])

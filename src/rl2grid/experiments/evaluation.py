@@ -303,6 +303,7 @@ class _FolderStore(_Store):
         if self._lock is None:
             self._folder.mkdir(parents=True, exist_ok=True)
             self._take_lock()
+            self._check_still_unused()
         if not self._partial.exists():
             self._describe(None)
             write_episodes(self._partial, self.episodes)
@@ -330,6 +331,15 @@ class _FolderStore(_Store):
         # Without the torn line that a kill may have left at the end.
         write_episodes(self._partial, episodes)
         return episodes
+
+    def _check_still_unused(self) -> None:
+        """Refuse what another process wrote since this evaluation began, when there was no folder."""
+        if not (self._folder / EVALUATION_FILE).exists():
+            return
+        _check_same_request(self._folder, self._request)
+        raise UsageError(
+            f"Another process wrote this evaluation to {self._folder} meanwhile: ask again to go on with what it wrote."
+        )
 
     def _describe(self, summary: Summary | None) -> None:
         write_evaluation(self._folder / EVALUATION_FILE, {**self._request, "command": self._command}, summary)
