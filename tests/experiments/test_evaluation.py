@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -26,9 +27,10 @@ from rl2grid.analysis.results import EVALUATION_FILE, EvaluationResult, load_eva
 from rl2grid.engines import ENGINES
 from rl2grid.envs.registration import register_all
 from rl2grid.errors import UsageError
+from rl2grid.experiments import evaluation
 from rl2grid.experiments.episode import environment_seed, play_episode
 from rl2grid.experiments.evaluation import PARTIAL_FILE, evaluate, run_evaluation
-from rl2grid.experiments.players import Job, Setting
+from rl2grid.experiments.players import Job, Setting, players
 from rl2grid.experiments.runs import hyperparameters
 from rl2grid.grids import GRID_IDS
 from rl2grid.scenarios.generated import VERSION
@@ -56,10 +58,15 @@ def _workers_find_the_fake_grid(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, paths)))
 
 
-def play(agent="random", jobs=JOBS, *, workers=0, output=None, identity=IDENTITY, **keywords) -> EvaluationResult:
+def play(agent=None, jobs=JOBS, *, workers=0, output=None, identity=IDENTITY, **keywords) -> EvaluationResult:
     keywords.setdefault("heuristic", "idle")
     return run_evaluation(
-        Setting(FAKE, agent, keywords), jobs, identity=identity, command="again", workers=workers, output=output
+        Setting(FAKE, agent or RandomAgent(), keywords),
+        jobs,
+        identity=identity,
+        command="again",
+        workers=workers,
+        output=output,
     )
 
 
@@ -379,6 +386,24 @@ def test_a_checkpoint_plays_as_it_was_trained(checkpoint, tmp_path):
     remote = evaluate(checkpoint, "bus14-T0", name="mine", workers=2, output=tmp_path / "out")
     assert without_times(remote.episodes) == without_times(alone.episodes)
     assert remote.identity == alone.identity
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_the_policy_played_is_the_one_whose_hash_is_stored(checkpoint, tmp_path, monkeypatch, workers):
+    """A run that still trains replaces its file at any moment, this one between the identity and the first episode."""
+    path = tmp_path / "best.pt"
+    shutil.copy(checkpoint, path)
+
+    def replaced(*arguments):
+        path.write_bytes(b"another policy")
+        return players(*arguments)
+
+    monkeypatch.setattr(evaluation, "players", replaced)
+    options = {"scenarios": list_scenarios("bus14", "validation")[:1], "name": "mine"}
+    result = evaluate(path, "bus14-T0", workers=workers, **options)
+    monkeypatch.undo()
+    assert path.read_bytes() == b"another policy"
+    assert without_times(result.episodes) == without_times(evaluate(checkpoint, "bus14-T0", **options).episodes)
 
 
 def test_a_checkpoint_of_another_task_is_refused(checkpoint):

@@ -92,7 +92,8 @@ def evaluate(
     chosen_scenarios = _checked_scenarios(task, split, scenarios)
     jobs = _jobs(chosen_scenarios, seeds, start)
     return run_evaluation(
-        Setting(task.id, agent, keywords),
+        # The agent whose identity is stored, not its path: a run that still trains replaces the file.
+        Setting(task.id, chosen, keywords),
         jobs,
         identity=_identity(task, chosen, name or chosen.name, keywords, start, chosen_scenarios),
         command=command or _call(agent, task, keywords, scenarios, seeds, start, name),
@@ -405,7 +406,7 @@ class _ProgressBar(_Display):
         self._steps: dict[Job, int] = {}
         self._finished = 0
         self._n_jobs = n_jobs
-        self._id = bar.add_task(f"Evaluating {_agent_name(setting)}", total=n_jobs, rate="", count=f"0/{n_jobs}")
+        self._id = bar.add_task(f"Evaluating {setting.agent.name}", total=n_jobs, rate="", count=f"0/{n_jobs}")
 
     def skip(self, jobs: Iterable[Job]) -> None:
         self._shares |= dict.fromkeys(jobs, 1.0)
@@ -431,10 +432,6 @@ class _ProgressBar(_Display):
             rate=f"{rate:,.0f} grid steps/s",
             count=f"{self._finished}/{self._n_jobs} episodes",
         )
-
-
-def _agent_name(setting: Setting) -> str:
-    return str(setting.agent) if isinstance(setting.agent, str | Path) else setting.agent.name
 
 
 @contextmanager

@@ -16,7 +16,6 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, NamedTuple, Protocol, Self
 
@@ -26,7 +25,6 @@ from rl2grid.agents.agent import Action, Agent, Info
 from rl2grid.envs.registration import register_all
 from rl2grid.envs.worker import take_standard_streams
 from rl2grid.errors import UsageError
-from rl2grid.experiments.agents import make_agent
 from rl2grid.experiments.episode import PlayedEpisode, play_episode
 
 _REPORT_SECONDS = 0.5
@@ -42,8 +40,8 @@ class Setting:
     """What all episodes of an evaluation have in common."""
 
     task: str
-    agent: str | Path | Agent
-    """A name, a path, or an agent that is not bound yet."""
+    agent: Agent
+    """Not bound yet; workers play copies of it."""
     env_keywords: Mapping[str, Any] = field(default_factory=dict)
     """Keywords of ``gymnasium.make``."""
 
@@ -98,8 +96,7 @@ class Player:
         register_all()
         self._env = gymnasium.make(setting.task, disable_env_checker=True, **setting.env_keywords)
         try:
-            agent = setting.agent
-            self._agent = make_agent(agent, setting.task) if isinstance(agent, str | Path) else agent
+            self._agent = setting.agent
             self._agent.bind(self._env)
         except BaseException:
             self._env.close()
