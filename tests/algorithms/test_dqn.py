@@ -183,6 +183,7 @@ def test_the_preset_paper_is_the_papers_table():
     [
         ({"learning_rate": 0.0}, "positive learning_rate"),
         ({"target_frequency": 0}, "target_frequency of at least 1"),
+        ({"layers": (8, 0)}, "layers of widths of at least 1"),
         ({"last_epsilon": 1.5}, "last_epsilon between 0 and 1"),
         ({"huber_delta": -1.0}, "positive huber_delta"),
         ({"exploration_do_nothing": math.nan}, "exploration_do_nothing between 0 and 1"),

@@ -806,6 +806,9 @@ def test_it_is_offered_for_all_tasks():
     ("changes", "sentence"),
     [
         ({"num_envs": 0}, "num_envs of at least 1"),
+        ({"initial_do_nothing": 1.0}, "initial_do_nothing above 0 and below 1"),
+        ({"actor_layers": (-3,)}, "actor_layers of widths of at least 1"),
+        ({"critic_layers": (8, 0)}, "critic_layers of widths of at least 1"),
         ({"cost_gamma": 1.5}, "cost_gamma between 0 and 1"),
         ({"cost_gamma": 1.0}, "needs a cost_scale"),
         ({"cost_scale": 0.0}, "positive cost_scale"),

@@ -645,6 +645,9 @@ def test_presets_can_be_changed_and_unknown_ones_are_refused():
     ("changes", "sentence"),
     [
         ({"num_envs": 0}, "num_envs of at least 1"),
+        ({"initial_do_nothing": 1.0}, "initial_do_nothing above 0 and below 1"),
+        ({"actor_layers": (-3,)}, "actor_layers of widths of at least 1"),
+        ({"critic_layers": (8, 0)}, "critic_layers of widths of at least 1"),
         ({"gamma": 1.5}, "gamma between 0 and 1"),
         ({"gamma": math.nan}, "gamma between 0 and 1"),
         ({"gamma": 1.0}, "reward_scale"),
@@ -759,7 +762,7 @@ def test_untrained_policy_does_nothing_as_often_as_asked():
     observations = torch.randn(50, trainer.network.observation_size, generator=torch.Generator().manual_seed(0))
     probabilities = trainer.network.actor(observations).softmax(-1)[:, 0]
     assert torch.allclose(probabilities, torch.full((50,), 0.6), atol=0.05)
-    with pytest.raises(UsageError, match="initial_do_nothing between 0 and 1"):
+    with pytest.raises(UsageError, match="initial_do_nothing above 0 and below 1"):
         replace(SMALL, initial_do_nothing=1.0)
 
 

@@ -351,7 +351,10 @@ def test_the_preset_paper_is_the_papers_table(continuous: bool):
         ({"initial_temperature": 0.0}, "positive initial_temperature"),
         ({"temperature_learning_rate": -1.0}, "positive temperature_learning_rate"),
         ({"first_entropy_share": 1.5}, "first_entropy_share between 0 and 1"),
-        ({"initial_do_nothing": 0.0}, "positive initial_do_nothing"),
+        ({"initial_do_nothing": 0.0}, "initial_do_nothing above 0 and below 1"),
+        ({"initial_do_nothing": 1.0}, "initial_do_nothing above 0 and below 1"),
+        ({"actor_layers": (-3,)}, "actor_layers of widths of at least 1"),
+        ({"critic_layers": (8, 0)}, "critic_layers of widths of at least 1"),
         ({"policy_frequency": 0}, "policy_frequency of at least 1"),
     ],
 )

@@ -138,6 +138,8 @@ def test_the_preset_paper_is_the_papers_table():
     [
         ({"tau": 0.0}, "positive tau"),
         ({"tau": 1.5}, "tau between 0 and 1"),
+        ({"actor_layers": (-3,)}, "actor_layers of widths of at least 1"),
+        ({"critic_layers": (8, 0)}, "critic_layers of widths of at least 1"),
         ({"policy_frequency": 0}, "policy_frequency of at least 1"),
         ({"exploration_noise": -0.1}, "exploration_noise of at least 0"),
     ],

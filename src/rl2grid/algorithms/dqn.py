@@ -84,6 +84,7 @@ class Args(OffPolicyArgs):
         super().__post_init__()
         self._check_counts("target_frequency", "networks")
         self._check_positive("learning_rate")
+        self._check_layers("layers")
         self._check_shares("first_epsilon", "last_epsilon", "epsilon_decay_fraction")
         if self.exploration_do_nothing is not None:
             self._check_shares("exploration_do_nothing")

@@ -128,6 +128,11 @@ class OffPolicyArgs:
             if getattr(self, name) < 1:
                 raise UsageError(f"{self.algorithm} needs {name} of at least 1, not {getattr(self, name)}.")
 
+    def _check_layers(self, *names: str) -> None:
+        for name in names:
+            if any(width < 1 for width in getattr(self, name)):
+                raise UsageError(f"{self.algorithm} needs {name} of widths of at least 1, not {getattr(self, name)}.")
+
     def _check_positive(self, *names: str) -> None:
         for name in names:
             if not 0.0 < getattr(self, name) < math.inf:

@@ -134,8 +134,11 @@ class Args:
         for name in ("actor_learning_rate", "critic_learning_rate", "clip_coefficient", "max_grad_norm"):
             if not 0.0 < getattr(self, name) < math.inf:
                 raise UsageError(f"PPO needs a positive {name}, not {getattr(self, name)}.")
+        for name in ("actor_layers", "critic_layers"):
+            if any(width < 1 for width in getattr(self, name)):
+                raise UsageError(f"PPO needs {name} of widths of at least 1, not {getattr(self, name)}.")
         if self.initial_do_nothing is not None and not 0.0 < self.initial_do_nothing < 1.0:
-            raise UsageError(f"PPO needs initial_do_nothing between 0 and 1, not {self.initial_do_nothing}.")
+            raise UsageError(f"PPO needs initial_do_nothing above 0 and below 1, not {self.initial_do_nothing}.")
         if self.device not in DEVICES:
             raise one_of("Device", self.device, DEVICES)
         if self.seed < 0:

@@ -55,7 +55,7 @@ from rl2grid.algorithms.off_policy import (
     make_network,
     random_legal_actions,
 )
-from rl2grid.errors import one_of
+from rl2grid.errors import UsageError, one_of
 
 # --- Hyperparameters ------------------------------------------------------------------------------------------------
 
@@ -102,9 +102,9 @@ class Args(OffPolicyArgs):
         self._check_positive("actor_learning_rate", "critic_learning_rate", "temperature_learning_rate")
         self._check_positive("tau", "initial_temperature")
         self._check_shares("tau", "first_entropy_share", "last_entropy_share")
-        if self.initial_do_nothing is not None:
-            self._check_positive("initial_do_nothing")
-            self._check_shares("initial_do_nothing")
+        self._check_layers("actor_layers", "critic_layers")
+        if self.initial_do_nothing is not None and not 0.0 < self.initial_do_nothing < 1.0:
+            raise UsageError(f"SAC needs initial_do_nothing above 0 and below 1, not {self.initial_do_nothing}.")
 
 
 def default(*, continuous: bool) -> Args:

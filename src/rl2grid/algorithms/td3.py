@@ -75,6 +75,7 @@ class Args(OffPolicyArgs):
         self._check_positive("actor_learning_rate", "critic_learning_rate", "tau", "noise_clip")
         self._check_not_negative("exploration_noise", "policy_noise")
         self._check_shares("tau")
+        self._check_layers("actor_layers", "critic_layers")
 
 
 def default(*, continuous: bool) -> Args:
