@@ -37,6 +37,7 @@ SMALL = Args(
     actor_layers=(8,),
     critic_layers=(8,),
 )
+MISSPELT = hyperparameters("lagrangian-ppo", "bus14-T0", constraints=("LIS",), thresholds=(1.0,))
 TIMES = ["charts/SPS", "charts/grid_SPS", "charts/environment_share"]
 
 
@@ -224,6 +225,7 @@ def _sizes(args: Args) -> dict[str, Any]:
         ({"task": "bus14-R"}, "Only discrete actions can be masked"),
         ({"task": "bus14-T0-LSI", "env_keywords": {"constraint": "TLO"}}, "contradicts task 'rl2grid/bus14-T0-LSI-v0'"),
         ({"algorithm": "lagrangian-ppo", "hyperparameters": hyperparameters("lagrangian-ppo", "bus14-T0")}, "needs a"),
+        ({"algorithm": "lagrangian-ppo", "hyperparameters": MISSPELT}, "'LIS' does not exist: choose one of LSI, TLO"),
     ],
 )
 def test_requests_that_cannot_be_met_leave_nothing_behind(tmp_path: Path, changes: dict[str, Any], sentence: str):

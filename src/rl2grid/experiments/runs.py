@@ -38,7 +38,7 @@ from rl2grid.algorithms.metrics import MetricsWriter
 from rl2grid.algorithms.off_policy import OffPolicyTrainer
 from rl2grid.algorithms.policy_agent import BEST_FILE, CHECKPOINT_FILE, PolicyAgent
 from rl2grid.envs.registration import register_all
-from rl2grid.envs.tasks import Task, TaskOptions, constraint_of, find_task
+from rl2grid.envs.tasks import CONSTRAINTS, Task, TaskOptions, constraint_of, find_task
 from rl2grid.errors import UsageError, one_of
 from rl2grid.experiments.energy import EnergyAccount
 from rl2grid.experiments.evaluation import evenly_spread
@@ -171,11 +171,16 @@ def find_limits(args: RunArgs) -> dict[str, float]:
     The constraint is the task's, or that of the keyword ``constraint``; Lagrangian PPO may have others of its own.
 
     Raises:
-        UsageError: Lagrangian PPO without a constraint, or a keyword that contradicts the task's id.
+        UsageError: Lagrangian PPO without a constraint, or with one whose costs the environments do not report, or a
+            keyword that contradicts the task's id.
     """
     constraint = constraint_of(find_task(args.task), args.env_keywords.get("constraint"))
     if isinstance(args.hyperparameters, lagrangian_ppo.Args):
-        return lagrangian_ppo.find_limits(args.hyperparameters, constraint)
+        limits = lagrangian_ppo.find_limits(args.hyperparameters, constraint)
+        for name in limits:
+            if name not in CONSTRAINTS:
+                raise one_of("Constraint", name, CONSTRAINTS)
+        return limits
     return {constraint: THRESHOLDS[constraint]} if constraint else {}
 
 
