@@ -14,6 +14,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pytest
 import torch
@@ -89,10 +90,23 @@ def assert_same(mine: Any, theirs: Any, where: str = "") -> None:
         assert len(mine) == len(theirs), where
         for k, (one, other) in enumerate(zip(mine, theirs, strict=True)):
             assert_same(one, other, f"{where}/{k}")
-    elif isinstance(mine, torch.Tensor):
-        assert torch.equal(mine, theirs), where
+    elif isinstance(mine, torch.Tensor | np.ndarray):
+        assert type(mine) is type(theirs), where
+        assert mine.dtype == theirs.dtype, where
+        equal = torch.equal if isinstance(mine, torch.Tensor) else np.array_equal
+        assert equal(mine, theirs), where
     else:
         assert str(mine) == str(theirs), where
+
+
+def test_runs_that_differ_in_one_element_are_not_the_same():
+    for zeros in (np.zeros(5000, np.float32), torch.zeros(5000)):
+        changed = zeros + 0
+        assert_same({"a": [zeros]}, {"a": [changed]})
+        changed[2500] = 1
+        for other in (changed, zeros[:-1], zeros.astype(float) if isinstance(zeros, np.ndarray) else zeros.double()):
+            with pytest.raises(AssertionError, match="/a/0"):
+                assert_same({"a": [zeros]}, {"a": [other]})
 
 
 # --- The folder -----------------------------------------------------------------------------------------------------
