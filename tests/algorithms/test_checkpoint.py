@@ -84,7 +84,18 @@ def test_a_checkpoint_of_another_task_is_refused_in_one_sentence(tmp_path: Path)
         load_checkpoint(tmp_path / "c.pt", task="rl2grid/bus14-T1-v0")
 
 
-@pytest.mark.parametrize("content", [b"", b"not a checkpoint", b"PK\x03\x04 torn"])
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"not a checkpoint",
+        b"PK\x03\x04 torn",
+        b"step,grid_steps,wall_time,name,value\n",
+        b"hello",
+        b'{"format": 1}',
+        b"2026-11-21T19:35:31+00:00 started at 0 of 384 decisions\n",
+    ],
+)
 def test_a_damaged_file_is_refused(tmp_path: Path, content: bytes):
     (tmp_path / "c.pt").write_bytes(content)
     with pytest.raises(UsageError, match="not a checkpoint"):
@@ -107,3 +118,6 @@ def test_a_missing_file_and_another_format_are_refused(tmp_path: Path):
     torch.save({"format": 99}, tmp_path / "c.pt")
     with pytest.raises(UsageError, match="format"):
         load_checkpoint(tmp_path / "c.pt")
+    torch.save({"format": 1}, tmp_path / "c.pt")
+    with pytest.raises(UsageError, match="names no task"):
+        load_checkpoint(tmp_path / "c.pt", task="rl2grid/bus14-T0-v0")

@@ -12,7 +12,6 @@ A checkpoint is a dictionary of plain values, NumPy arrays and tensors with the 
 from __future__ import annotations
 
 import os
-import pickle
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -57,10 +56,13 @@ def load_checkpoint(path: Path, *, task: str | None = None) -> dict[str, Any]:
         raise UsageError(f"Checkpoint {str(path)!r} does not exist: give the path of a checkpoint file.")
     try:
         contents = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, OSError) as error:
+    except Exception as error:
+        # The loader takes the bytes of any other file for instructions, which fail in whatever way.
         raise UsageError(f"File {str(path)!r} is not a checkpoint that can be read.") from error
     if not isinstance(contents, dict) or contents.get("format") != FORMAT:
         raise UsageError(f"File {str(path)!r} is not a checkpoint of format {FORMAT}, the one that can be read.")
+    if "task" not in contents:
+        raise UsageError(f"File {str(path)!r} is not a checkpoint that can be read: it names no task.")
     if task is not None and contents["task"] != task:
         raise UsageError(
             f"Checkpoint {str(path)!r} is of task {contents['task']!r} and cannot be used for task {task!r}."
