@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import shlex
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
+from test_runs import toy_envs
 
 from rl2grid.cli import train as command
 from rl2grid.cli.keywords import NAMES
@@ -14,7 +16,7 @@ from rl2grid.cli.main import main
 from rl2grid.envs.tasks import find_task
 from rl2grid.errors import UsageError
 from rl2grid.experiments import runs
-from rl2grid.experiments.commands import train_command
+from rl2grid.experiments.commands import train_command, training_command
 from rl2grid.experiments.flags import evaluate_command, flags
 
 CASES: list[tuple[str, str, str, dict[str, Any], dict[str, Any]]] = [
@@ -55,6 +57,29 @@ def test_a_command_asks_for_the_run_that_it_was_made_from(
 def test_what_has_no_influence_on_results_is_left_out():
     args = runs.RunArgs("rl2grid/bus14-T0-v0", runs.hyperparameters("ppo", "bus14-T0", torch_threads=2))
     assert train_command(args) == "rl2grid train ppo bus14-T0"
+
+
+def test_a_run_without_validation_is_resumed_and_made_again_without(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    heard: list[Any] = []
+
+    def train(args: runs.RunArgs, **chosen: Any) -> Path:
+        heard.append(chosen["evaluate"])
+        return original(args, make_envs=toy_envs, **chosen)
+
+    def resume(folder: Path, **chosen: Any) -> Path:
+        heard.append(chosen["evaluate"])
+        return folder
+
+    original, folder = runs.train, tmp_path / "run"
+    monkeypatch.setattr(runs, "train", train)
+    monkeypatch.setattr(runs, "resume", resume)
+    sizes = ["--num-envs", "4", "--num-steps", "8", "--total-timesteps", "32"]
+    asked = ["ppo", "bus14-T0", *sizes, "--validation-months", "0", "--folder", str(folder)]
+    assert command.train(asked) == 0
+    assert command.train(["--resume", str(folder)]) == 0
+    assert heard == [None, None]
+    assert not (folder / "best.pt").exists()
+    assert "--validation-months 0" in training_command(folder)
 
 
 @pytest.mark.parametrize(

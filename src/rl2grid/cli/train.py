@@ -62,9 +62,7 @@ class TrainFlags:
     evaluate_every: int = 50_000
     """Decisions between two evaluations on the validation scenarios."""
     validation_months: int | None = None
-    """Validation scenarios that are played, evenly spread; None: all."""
-    validate: bool = True
-    """Whether the best policy is picked on the validation scenarios."""
+    """Validation scenarios that are played, evenly spread; None: all; 0: none, so that no best policy is picked."""
     checkpoint_seconds: float = 60.0
     """A checkpoint is written when the last one is older than this, and at the end."""
     max_minutes: float | None = None
@@ -104,14 +102,14 @@ def _resume(arguments: list[str]) -> int:
     if not arguments or arguments[0].startswith("-"):
         raise UsageError("Resuming needs one run folder, for example `rl2grid train --resume runs/bus14-T0-v0-ppo-1`.")
     from rl2grid.experiments import runs
-    from rl2grid.experiments.validation import validator
+    from rl2grid.experiments.validation import find_validator
 
     path, flags = Path(arguments[0]), arguments[1:]
     _refuse_unknown(flags, [*fields(ResumeFlags)])
     own = _parse("rl2grid train --resume", flags, ResumeFlags())
     limit = TimeLimit(own.max_minutes)
     args, _ = runs.read_config(path)
-    folder = runs.resume(path, evaluate=validator(args), limit=limit)
+    folder = runs.resume(path, evaluate=find_validator(args), limit=limit)
     return _report(folder, args.task, limit)
 
 
@@ -119,7 +117,7 @@ def _begin(algorithm: str, task_id: str, flags: list[str]) -> int:
     task = find_task(task_id)
     try:
         from rl2grid.experiments import runs
-        from rl2grid.experiments.validation import validator
+        from rl2grid.experiments.validation import find_validator
     except ImportError as error:
         raise UsageError(f"Training needs {error.name}: install it with `pip install rl2grid[train]`.") from None
     if algorithm not in runs.ALGORITHMS:
@@ -145,7 +143,7 @@ def _begin(algorithm: str, task_id: str, flags: list[str]) -> int:
         validation_months=own.validation_months,
         wandb_project=own.wandb_project if own.track else None,
     )
-    folder = runs.train(args, evaluate=validator(args) if own.validate else None, limit=limit)
+    folder = runs.train(args, evaluate=find_validator(args), limit=limit)
     return _report(folder, task.id, limit)
 
 

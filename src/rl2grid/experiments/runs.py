@@ -135,7 +135,7 @@ class RunArgs:
     evaluate_every: int = 50_000
     """Decisions between two evaluations on the validation scenarios; there is one more at the end."""
     validation_months: int | None = None
-    """Validation scenarios that are played, evenly spread; None: all."""
+    """Validation scenarios that are played, evenly spread; None: all; 0: none, so that there is no ``best.pt``."""
     tensorboard: bool = True
     """Whether to write TensorBoard events beside ``metrics.csv``."""
     wandb_project: str | None = None
@@ -506,7 +506,8 @@ def _resolved(args: RunArgs) -> RunArgs:
         raise UsageError(f"Training on the {keywords['split']} scenarios is refused: choose split {TRAIN!r}.")
     if args.evaluate_every < 1:
         raise UsageError(f"evaluate_every must be at least 1 decision, not {args.evaluate_every}.")
-    evenly_spread(task.id, VALIDATION, args.validation_months)
+    if args.validation_months != 0:
+        evenly_spread(task.id, VALIDATION, args.validation_months)
     check_tracking(args.wandb_project)
     folder = args.folder or Path("runs") / f"{_slug(task)}-{args.algorithm}-{args.hyperparameters.seed}"
     resolved = replace(args, task=task.id, folder=Path(folder), env_keywords=keywords)

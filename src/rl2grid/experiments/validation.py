@@ -43,3 +43,12 @@ def validator(args: runs.RunArgs) -> runs.Evaluate:
         return {**means, "safe_completed": float(safe_episodes(result.episodes, limits).mean())} if limits else means
 
     return validate
+
+
+def find_validator(args: runs.RunArgs) -> runs.Evaluate | None:
+    """The :func:`validator` of a run; None for one that asks for no validation.
+
+    Raises:
+        UsageError: the run cannot be constrained as asked.
+    """
+    return None if args.validation_months == 0 else validator(args)
