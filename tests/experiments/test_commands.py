@@ -25,6 +25,7 @@ CASES: list[tuple[str, str, str, dict[str, Any], dict[str, Any]]] = [
     ("sac", "bus14-R", "paper", {"gamma": 0.95}, {"maintenance": False, "dispatch": "grid2op", "constraint": "TLO"}),
     ("td3", "bus14-R", "default", {}, {"reward": (1.0, 0.5, 1e-3), "normalize": None, "opponent": False}),
     ("dqn", "bus36-M-T0", "default", {"mask_actions": False, "huber_delta": None}, {"reward": "paper"}),
+    ("ppo", "bus14-T0", "paper", {"torch_threads": 2, "device": "auto"}, {"scenario": "a month/of its own"}),
     ("lagrangian-ppo", "bus14-T0-TLO", "default", {"thresholds": (20.0,), "constraints": ("TLO",)}, {}),
 ]
 
@@ -55,7 +56,9 @@ def test_a_command_asks_for_the_run_that_it_was_made_from(
 
 
 def test_what_has_no_influence_on_results_is_left_out():
-    args = runs.RunArgs("rl2grid/bus14-T0-v0", runs.hyperparameters("ppo", "bus14-T0", torch_threads=2))
+    args = runs.RunArgs(
+        "rl2grid/bus14-T0-v0", runs.hyperparameters("ppo", "bus14-T0"), num_threads=2, checkpoint_seconds=1.0
+    )
     assert train_command(args) == "rl2grid train ppo bus14-T0"
 
 

@@ -235,6 +235,7 @@ def _sizes(args: Args) -> dict[str, Any]:
         ({"env_keywords": {"gamma": 0.9}}, "gamma belongs to"),
         ({"env_keywords": {"split": "test"}}, "Training on the test scenarios"),
         ({"env_keywords": {"reward": lambda state, i: 0.0}}, "stores its reward by name"),
+        ({"env_keywords": {"scenario": "nowhere"}}, "Scenario 'nowhere' is not in the split train"),
         ({"evaluate_every": 0}, "evaluate_every"),
         ({"task": "bus14-R"}, "Only discrete actions can be masked"),
         ({"task": "bus14-T0-LSI", "env_keywords": {"constraint": "TLO"}}, "contradicts task 'rl2grid/bus14-T0-LSI-v0'"),

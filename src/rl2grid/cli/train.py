@@ -41,6 +41,8 @@ class TrainFlags:
     """Run folder, which must not exist yet; None: runs/<task>-<algorithm>-<seed>."""
     heuristic: str | None = None
     """What plays while the grid is safe: None, ``idle`` or ``recovery``."""
+    scenario: str | None = None
+    """Train on this scenario only; None: on all of the training split."""
     reward: str = "default"
     """Reward preset, ``default``, ``paper`` or ``released``, or weights of its three components: ``1,0.5,0``."""
     constraint: str | None = None
@@ -127,7 +129,7 @@ def _begin(algorithm: str, task_id: str, flags: list[str]) -> int:
     _refuse_unknown(flags, [*fields(TrainFlags), *fields(chosen.args)])
     own, hyperparameters = _parse_both(f"rl2grid train {algorithm} {task.id}", flags, hyperparameters)
     limit = TimeLimit(own.max_minutes)
-    keywords = {name: getattr(own, name) for name in ("heuristic", *NAMES)}
+    keywords = {name: getattr(own, name) for name in ("heuristic", "scenario", *NAMES)}
     keywords["reward"] = reward_of(own.reward)
     TaskOptions(**keywords)
     args = runs.RunArgs(

@@ -10,12 +10,12 @@ from rl2grid.envs.tasks import short_id
 from rl2grid.experiments import runs
 from rl2grid.experiments.flags import environment_flags, flags
 
-WITHOUT_INFLUENCE = frozenset({"torch_threads", "device"})
-"""Hyperparameters that say where is computed, not what."""
-
 
 def train_command(args: runs.RunArgs, preset: str = "default") -> str:
     """The shortest ``rl2grid train`` that makes a run again: everything that its preset does not say.
+
+    The number of PyTorch's threads and the device are in it, because results are the same bit for bit for these only;
+    what has no influence on results is not.
 
     Args:
         args: the run.
@@ -25,8 +25,6 @@ def train_command(args: runs.RunArgs, preset: str = "default") -> str:
     words += ["--preset", preset] if preset != "default" else []
     chosen, original = asdict(args.hyperparameters), asdict(runs.hyperparameters(args.algorithm, args.task, preset))
     changes = {name: value for name, value in chosen.items() if value != original[name]}
-    for name in WITHOUT_INFLUENCE & set(changes):
-        del changes[name]
     words += [*environment_flags(args.env_keywords), *flags(changes)]
     if args.evaluate_every != runs.RunArgs.evaluate_every:
         words += ["--evaluate-every", str(args.evaluate_every)]

@@ -47,7 +47,7 @@ from rl2grid.experiments.limits import TimeLimit
 from rl2grid.experiments.tracking import check_tracking, tracked
 from rl2grid.mdp.actions import action_set_hash
 from rl2grid.mdp.constraints import THRESHOLDS
-from rl2grid.scenarios.library import generator_version, scenario_pack_hash
+from rl2grid.scenarios.library import check_in_split, generator_version, scenario_pack_hash
 from rl2grid.scenarios.splits import TRAIN, VALIDATION
 from rl2grid.versions import library_versions
 
@@ -504,6 +504,8 @@ def _resolved(args: RunArgs) -> RunArgs:
     keywords = {name: getattr(TaskOptions(**keywords), name) for name in allowed}
     if keywords["split"] != TRAIN:
         raise UsageError(f"Training on the {keywords['split']} scenarios is refused: choose split {TRAIN!r}.")
+    if keywords["scenario"] is not None:
+        check_in_split(task.grid_id, TRAIN, keywords["scenario"])
     if args.evaluate_every < 1:
         raise UsageError(f"evaluate_every must be at least 1 decision, not {args.evaluate_every}.")
     if args.validation_months != 0:
