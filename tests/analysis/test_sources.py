@@ -78,7 +78,7 @@ def test_a_label_renames_episodes_alone(tmp_path):
     [
         ("{}/nothing", None, "is no folder"),
         ("{}/empty", None, "holds neither a run nor a study nor an evaluation on validation"),
-        ("{}/torn", None, "is unfinished: continue it with rl2grid evaluate"),
+        ("{}/torn", None, "torn --output /"),
         ("{}/run", None, "metrics.csv is no metrics file"),
         ("{}/study", "train", "has no finished cell that was evaluated on train yet"),
         ("mine={}/study", None, "A study has names of its own"),

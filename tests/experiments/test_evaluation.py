@@ -156,7 +156,7 @@ def test_an_interrupted_evaluation_plays_only_what_is_missing(tmp_path):
     with pytest.raises(ValueError, match="told to fail"):
         play(output=tmp_path / "out", log=str(log), fail_on="may")
     assert len(read_episodes(tmp_path / "out" / PARTIAL_FILE)) == 4
-    with pytest.raises(UsageError, match="is unfinished: continue it with again"):
+    with pytest.raises(UsageError, match=r"is unfinished: continue it with again, with output='.*out'"):
         load_evaluation(tmp_path / "out")
     log.unlink()
     result = play(output=tmp_path / "out", log=str(log))

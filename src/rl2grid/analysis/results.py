@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -72,8 +73,16 @@ def load_evaluation(folder: Path) -> EvaluationResult:
         raise UsageError(f"{folder} holds no evaluation: give a folder that 'rl2grid evaluate' wrote.")
     request = read_request(folder / EVALUATION_FILE)
     if not (folder / EPISODES_FILE).is_file():
-        raise UsageError(f"The evaluation in {folder} is unfinished: continue it with {request['command']}.")
+        raise UsageError(f"The evaluation in {folder} is unfinished: continue it with {_continuing(request, folder)}.")
     return EvaluationResult(read_episodes(folder / EPISODES_FILE), request["identity"], request["command"], folder)
+
+
+def _continuing(request: Mapping[str, Any], folder: Path) -> str:
+    """The stored command says what is played, not where it is stored."""
+    command: str = request["command"]
+    if command.startswith("rl2grid "):
+        return f"{command} {shlex.join(('--output', str(folder)))}"
+    return f"{command}, with output={str(folder)!r}"
 
 
 def check_comparable(results: Sequence[EvaluationResult]) -> None:
