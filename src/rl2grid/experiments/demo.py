@@ -6,6 +6,7 @@ training goes on from its checkpoint, an evaluation with the episodes that are m
 
 from __future__ import annotations
 
+import shlex
 import time
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from rl2grid.errors import UsageError
 from rl2grid.experiments import runs
 from rl2grid.experiments.agents import make_agent
 from rl2grid.experiments.evaluation import evaluate
+from rl2grid.experiments.flags import flags
 from rl2grid.experiments.recording import record_episode
 from rl2grid.experiments.validation import validator
 from rl2grid.scenarios.library import list_scenarios
@@ -74,11 +76,17 @@ def run_demo(output: Path, decisions: int | None = None) -> Path:
         ),
         curves=[read_training_curve(run, "PPO with the idle heuristic")],
         recordings=[recording],
-        commands={"training": "rl2grid demo", "episodes": "rl2grid demo"},
+        commands=dict.fromkeys(("training", "episodes"), demo_command(output, decisions)),
     )
     console.print(rich_table([result.summary for result in results], title=f"{TASK}, test scenarios"))
     console.print(f"Report: {report} ({time.perf_counter() - began:.0f} s)")
     return report
+
+
+def demo_command(output: Path, decisions: int | None) -> str:
+    """What to type for :func:`run_demo` to be called like that."""
+    length = {} if decisions is None else {"decisions": decisions}
+    return shlex.join(["rl2grid", "demo", *flags({**length, "output": output})])
 
 
 def _contestants(run: Path) -> list[tuple[str, str | None]]:
