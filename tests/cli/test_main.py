@@ -79,6 +79,28 @@ def test_refusals_are_one_sentence_with_what_is_allowed(capsys, tmp_path, monkey
     assert not list(tmp_path.iterdir()), "a refused command must write nothing"
 
 
+def test_an_interrupt_at_once_tells_how_the_training_goes_on(capsys, tmp_path, monkeypatch):
+    def interrupted(args, **_):
+        if args.task == "rl2grid/bus14-T0-v0":
+            Path("runs/bus14-T0-v0-ppo-1").mkdir(parents=True)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("rl2grid.experiments.runs.train", interrupted)
+    monkeypatch.chdir(tmp_path)
+    assert main(["train", "ppo", "bus14-T0", "--seed", "1"]) == 130
+    assert "go on with `rl2grid train --resume runs/bus14-T0-v0-ppo-1`" in capsys.readouterr().err
+    assert main(["train", "ppo", "bus14-R", "--seed", "1"]) == 130
+    assert "the same command goes on" in capsys.readouterr().err
+
+
+def test_the_report_of_a_training_reads_its_checkpoint_once(capsys, monkeypatch):
+    asked = []
+    monkeypatch.setattr("rl2grid.experiments.runs.train", lambda args, **_: Path("run"))
+    monkeypatch.setattr("rl2grid.experiments.runs.is_finished", asked.append)
+    assert main(["train", "ppo", "bus14-T0"]) == 130
+    assert asked == [Path("run")]
+
+
 def test_help_of_training_lists_hyperparameters_with_their_meaning(capsys):
     with pytest.raises(SystemExit) as exit_:
         main(["train", "ppo", "bus14-T0", "--help"])

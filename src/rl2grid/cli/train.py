@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import difflib
 import io
+import sys
 from dataclasses import Field, dataclass, fields, make_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -145,7 +146,14 @@ def _begin(algorithm: str, task_id: str, flags: list[str]) -> int:
         validation_months=own.validation_months,
         wandb_project=own.wandb_project if own.track else None,
     )
-    folder = runs.train(args, evaluate=find_validator(args), limit=limit)
+    try:
+        folder = runs.train(args, evaluate=find_validator(args), limit=limit)
+    except KeyboardInterrupt:
+        folder = runs.find_folder(args)
+        if not folder.exists():
+            raise  # the same command begins it
+        print(f"rl2grid: interrupted; go on with `rl2grid train --resume {folder}`.", file=sys.stderr)
+        return INTERRUPTED
     return _report(folder, task.id, limit)
 
 
@@ -156,10 +164,11 @@ def _report(folder: Path, task_id: str, limit: TimeLimit) -> int:
     used = energy_line(folder)
     if used:
         print(f"Energy of the run so far: {used}, see {folder / 'energy.json'}.")
-    if not runs.is_finished(folder) and limit.reached:
+    finished = runs.is_finished(folder)
+    if not finished and limit.reached:
         print(f"Run stopped by --max-minutes: {folder}. Go on with `rl2grid train --resume {folder}`.")
         return 0
-    if not runs.is_finished(folder):
+    if not finished:
         print(f"Run stopped: {folder}. Go on with `rl2grid train --resume {folder}`.")
         return INTERRUPTED
     print(f"Run complete: {folder}. Evaluate it with `rl2grid evaluate {folder} {task_id} --split test`.")

@@ -184,6 +184,12 @@ def find_limits(args: RunArgs) -> dict[str, float]:
     return {constraint: THRESHOLDS[constraint]} if constraint else {}
 
 
+def find_folder(args: RunArgs) -> Path:
+    """Where a run is written."""
+    task = find_task(args.task).id.removeprefix("rl2grid/")
+    return Path(args.folder or Path("runs") / f"{task}-{args.algorithm}-{args.hyperparameters.seed}")
+
+
 def score(means: Mapping[str, float], limits: Mapping[str, float]) -> tuple[float, ...]:
     """What the best policy has most of, in the order of importance; of equals the latest is kept.
 
@@ -511,14 +517,9 @@ def _resolved(args: RunArgs) -> RunArgs:
     if args.validation_months != 0:
         evenly_spread(task.id, VALIDATION, args.validation_months)
     check_tracking(args.wandb_project)
-    folder = args.folder or Path("runs") / f"{_slug(task)}-{args.algorithm}-{args.hyperparameters.seed}"
-    resolved = replace(args, task=task.id, folder=Path(folder), env_keywords=keywords)
+    resolved = replace(args, task=task.id, folder=find_folder(args), env_keywords=keywords)
     find_limits(resolved)  # refuses what cannot be constrained
     return resolved
-
-
-def _slug(task: Task) -> str:
-    return task.id.removeprefix("rl2grid/")
 
 
 def _checked_algorithm(name: str, task: Task) -> Algorithm:
