@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from rl2grid.algorithms import ppo
 from rl2grid.analysis.results import load_evaluation
 from rl2grid.cli.main import main
 
@@ -77,6 +78,29 @@ def test_refusals_are_one_sentence_with_what_is_allowed(capsys, tmp_path, monkey
     monkeypatch.chdir(tmp_path)
     assert part in refused(capsys, *command_line)
     assert not list(tmp_path.iterdir()), "a refused command must write nothing"
+
+
+@pytest.mark.parametrize(
+    "command_line",
+    [
+        ["evaluate", "do-nothing", "bus14-T0", "--output"],
+        ["train", "ppo", "bus14-T0", "--folder"],
+        ["rank", "bus14", "--output"],
+        ["watch", "do-nothing", "bus14-T0", "--output"],
+        ["demo", "--output"],
+        ["study", "run", "paper", "--scale", "quick", "--output"],
+        ["study", "tune", "TUNING", "--output"],
+    ],
+)
+def test_outputs_below_a_file_are_refused_before_anything_is_played(capsys, tmp_path, monkeypatch, command_line):
+    (tmp_path / "file").write_text("")
+    tuning = 'algorithm = "ppo"\ntask = "bus14-T0"\ntrials = 1\nname = "few"\n'
+    (tmp_path / "few.toml").write_text(tuning)
+    command_line = [str(tmp_path / "few.toml") if word == "TUNING" else word for word in command_line]
+    monkeypatch.setattr(ppo.PPO, "iterate", None)
+    monkeypatch.setattr("rl2grid.experiments.players.play_episode", None)
+    sentence = refused(capsys, *command_line, str(tmp_path / "file" / "a" / "b"))
+    assert "cannot be made" in sentence
 
 
 def test_an_interrupt_at_once_tells_how_the_training_goes_on(capsys, tmp_path, monkeypatch):

@@ -17,7 +17,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from rl2grid.analysis import figures, tables
-from rl2grid.analysis.files import write_text
+from rl2grid.analysis.files import make_folder, write_text
 from rl2grid.analysis.page import (
     cell_html,
     code_html,
@@ -77,7 +77,7 @@ def write_report(
     commands = dict(commands or {})
     summaries = [result.summary for result in results]
     pictures = _pictures(results, curves, recordings, commands)
-    (folder / FIGURES_FOLDER).mkdir(parents=True, exist_ok=True)
+    make_folder(folder / FIGURES_FOLDER)
     drawn = []
     for picture in pictures:
         light = picture.draw(LIGHT)

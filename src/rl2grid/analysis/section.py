@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from rl2grid.analysis import comparison_figures as compare
 from rl2grid.analysis import figures
 from rl2grid.analysis.ending_figures import draw_ending_bars, draw_ending_map
-from rl2grid.analysis.files import write_text
+from rl2grid.analysis.files import make_folder, write_text
 from rl2grid.analysis.methods import Method, group_methods
 from rl2grid.analysis.result_tables import Methods, result_tables
 from rl2grid.analysis.results import EvaluationResult
@@ -102,7 +102,7 @@ def results_section(
     """
     section = plan or plan_section(results, runs)
     for name in (TABLES_FOLDER, FIGURES_FOLDER):
-        (folder / name).mkdir(parents=True, exist_ok=True)
+        make_folder(folder / name)
     for table in section.tables:
         on_file(table.name)
         for suffix, writer in WRITERS.items():

@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 from rl2grid.analysis.action_space import ActionRow, explain_action, list_actions, select_actions
+from rl2grid.analysis.files import make_folder
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid, load_grid
 from rl2grid.mdp.actions import StepAction, full_catalogue
@@ -130,7 +131,7 @@ def _draw(grid: Grid, action: StepAction, path: Path) -> Path:
     if suffix not in ("png", "pdf", "svg"):
         raise UsageError(f"{path.name} is no picture that can be drawn: end its name with .png, .pdf or .svg.")
     figure = action_figures.draw_action(grid, action)
-    _make_folder(path.parent)
+    make_folder(path.parent)
     (written,) = figures.save_figure(figure, path.with_suffix(""), formats=(suffix,))
     return Path(written)
 
@@ -142,7 +143,7 @@ def _write_figures(grid: Grid, folder: Path) -> int:
         "trials": action_figures.draw_trials(grid),
         "ranking": action_figures.draw_ranking(grid),
     }
-    _make_folder(folder)
+    make_folder(folder)
     for name, figure in drawn.items():
         paths = figures.save_figure(figure, folder / f"{grid.id}-{name}")
         print(f"Written: {', '.join(str(path) for path in paths)}")
@@ -155,13 +156,6 @@ def _figure_modules() -> tuple[ModuleType, ModuleType]:
     except ImportError as error:
         raise UsageError(f"Drawing needs {error.name}: install it with `pip install rl2grid[analysis]`.") from None
     return action_figures, figures
-
-
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(f"Folder {folder} cannot be made: {error.strerror}.") from None
 
 
 def _table(title: str | None) -> Table:

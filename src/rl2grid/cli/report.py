@@ -10,6 +10,7 @@ from typing import Any
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
+from rl2grid.analysis.files import make_folder
 from rl2grid.analysis.sources import Sources, load_sources
 from rl2grid.analysis.training import TrainingRun
 from rl2grid.cli.analyse import SPLIT_HELP
@@ -44,7 +45,8 @@ def _run(options: argparse.Namespace) -> int:
     plan = section.plan_section(sources.results, sources.runs)
     number = len(plan.pictures)
     train_commands = _train_commands(sources.runs)
-    path = _page_path(options.output)
+    make_folder(options.output)
+    path = options.output / PAGE_FILE
     with Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), transient=True) as bar:
         task = bar.add_task("Drawing", total=number)
         size = results_page.write_results_page(
@@ -71,14 +73,6 @@ def _train_commands(runs: Sequence[TrainingRun]) -> dict[Path, str]:
     except ImportError as error:
         raise UsageError(f"Reports of runs need {error.name}: install it with `pip install rl2grid[train]`.") from None
     return {run.folder: training_command(run.folder) for run in runs}
-
-
-def _page_path(folder: Path) -> Path:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(f"Folder {folder} cannot be made: {error.strerror}.") from None
-    return folder / PAGE_FILE
 
 
 def _title(sources: Sources) -> str:

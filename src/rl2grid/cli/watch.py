@@ -11,6 +11,7 @@ from typing import Any
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from rl2grid.analysis.files import make_folder
 from rl2grid.cli.train import INTERRUPTED
 from rl2grid.engines import HEURISTICS
 from rl2grid.envs.tasks import find_task
@@ -49,10 +50,7 @@ def _run(options: argparse.Namespace) -> int:
     animation, watch_page = _drawing_modules()
     for suffix in options.format:
         animation.check_encoder(suffix)
-    try:
-        options.output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(f"Folder {options.output} cannot be made: {error.strerror}.") from None
+    make_folder(options.output)
     try:
         with _progress() as progress:
             recording = _play(options, progress)

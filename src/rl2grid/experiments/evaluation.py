@@ -29,6 +29,7 @@ from filelock import FileLock, Timeout
 
 from rl2grid.agents.agent import Agent
 from rl2grid.analysis.episodes import EPISODES_FILE, Episode, format_row, read_episodes, write_episodes
+from rl2grid.analysis.files import check_folder, make_folder
 from rl2grid.analysis.results import EVALUATION_FILE, EvaluationResult, identity_hash, read_request, write_evaluation
 from rl2grid.analysis.summary import Summary, summarise
 from rl2grid.envs.tasks import Task, TaskOptions, constraint_of, find_task
@@ -290,6 +291,7 @@ class _FolderStore(_Store):
         self._finished, self._partial = folder / EPISODES_FILE, folder / PARTIAL_FILE
         self._lock: FileLock | None = None
         if not folder.exists():
+            check_folder(folder)
             return
         if not folder.is_dir():
             raise UsageError(f"{folder} is a file: give a folder to store the evaluation in.")
@@ -302,7 +304,7 @@ class _FolderStore(_Store):
 
     def add(self, episode: Episode) -> None:
         if self._lock is None:
-            self._folder.mkdir(parents=True, exist_ok=True)
+            make_folder(self._folder)
             self._take_lock()
             self._check_still_unused()
         if not self._partial.exists():

@@ -43,6 +43,7 @@ import platformdirs
 from numpy.typing import NDArray
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from rl2grid.analysis.files import make_folder
 from rl2grid.compile import cache_directory
 from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.engines.native.what_if import WhatIf, snapshot_of
@@ -126,7 +127,7 @@ def run_ranking(
         The file written.
 
     Raises:
-        UsageError: no such grid or sampling, or a number that is too small.
+        UsageError: no such grid or sampling, a number that is too small, or an output folder that cannot be made.
     """
     grid = load_grid(grid_id)
     if states < 2:
@@ -135,6 +136,8 @@ def run_ranking(
         raise UsageError(f"seed={seed} is not allowed: give 0 or more.")
     if sampling not in SAMPLINGS:
         raise one_of("Sampling", sampling, SAMPLINGS)
+    output = output or Path("rankings")
+    make_folder(output)
     pack = scenario_pack_hash(grid_id, "train")
     folder = _work_folder(grid, work, f"{pack} {states} {seed} {sampling}")
     with _progress(grid_id) as progress:
@@ -157,7 +160,7 @@ def run_ranking(
         "levels_shared_by_halves": _stability(grid, trials),
         "packages": {name: version(name) for name in ("numpy", "numba")},
     }
-    return _write(output or Path("rankings"), grid_id, order, scores, metadata)
+    return _write(output, grid_id, order, scores, metadata)
 
 
 def score(trials: Trials) -> Scores:
@@ -394,12 +397,11 @@ def _work_folder(grid: Grid, work: Path | None, request: str) -> Path:
     root = work or Path(platformdirs.user_cache_dir("rl2grid")) / "rankings"
     digest = hashlib.sha256(f"{VERSION} {grid.hash} {request} {cache_directory().name}".encode()).hexdigest()[:12]
     folder = root / f"{grid.id}-{digest}"
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     return folder
 
 
 def _write(folder: Path, grid_id: str, ids: I32, scores: Scores, metadata: dict[str, Any]) -> Path:
-    folder.mkdir(parents=True, exist_ok=True)
     file = folder / f"{grid_id}.ranking.npz"
     _save(
         file,

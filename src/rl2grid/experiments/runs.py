@@ -37,6 +37,7 @@ from rl2grid.algorithms.checkpoint import load_checkpoint, save_checkpoint
 from rl2grid.algorithms.metrics import MetricsWriter
 from rl2grid.algorithms.off_policy import OffPolicyTrainer
 from rl2grid.algorithms.policy_agent import BEST_FILE, CHECKPOINT_FILE, PolicyAgent
+from rl2grid.analysis.files import make_folder
 from rl2grid.envs.registration import register_all
 from rl2grid.envs.tasks import CONSTRAINTS, Task, TaskOptions, constraint_of, find_task
 from rl2grid.errors import UsageError, one_of
@@ -560,10 +561,10 @@ def _create_folder(folder: Path, args: RunArgs, identity: Mapping[str, Any]) -> 
         "first_environment": args.hyperparameters.seed * args.hyperparameters.num_envs,
     }
     config = {"request": _request(args), "identity": dict(identity), "seeds": seeds}
-    folder.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(folder.parent)
     temporary = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
-    temporary.mkdir()
     try:
+        temporary.mkdir()
         (temporary / CONFIG_FILE).write_text(json.dumps(config, indent=2) + "\n", encoding="utf-8")
         os.rename(temporary, folder)
     except OSError as error:

@@ -27,7 +27,7 @@ from rich.table import Table
 from rich.text import Text
 
 from rl2grid.analysis.episodes import COLUMNS, EPISODES_FILE, format_row, read_episodes
-from rl2grid.analysis.files import write_json
+from rl2grid.analysis.files import make_folder, write_json
 from rl2grid.analysis.sources import EVALUATION_FOLDER, RUN_FOLDER, STUDY_FILE
 from rl2grid.analysis.training import METRICS_FILE, VALIDATION
 from rl2grid.experiments.interrupts import stop_requests
@@ -164,6 +164,7 @@ def run_study(study: Study, backend: Backend, console: Console | None = None) ->
         UsageError: the study's folder holds cells of another definition; nothing was begun.
         KeyboardInterrupt: the user asked to stop; all cells have written their checkpoints.
     """
+    make_folder(study.output)
     for cell in study.cells:
         if (study.folder(cell)).exists():
             prepare(study.folder(cell), cell)

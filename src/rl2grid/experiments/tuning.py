@@ -34,7 +34,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from rl2grid.algorithms.policy_agent import PolicyAgent
-from rl2grid.analysis.files import write_json
+from rl2grid.analysis.files import make_folder, write_json
 from rl2grid.analysis.training import read_validations
 from rl2grid.engines import HEURISTICS
 from rl2grid.envs.tasks import find_task
@@ -453,7 +453,7 @@ def _prepare(tuning: Tuning) -> None:
                     f"{tuning.output} holds a search with another {key}: remove it, or choose another folder with "
                     "--output."
                 )
-    tuning.output.mkdir(parents=True, exist_ok=True)
+    make_folder(tuning.output)
     write_json(path, wanted)
 
 
