@@ -139,6 +139,16 @@ def test_included_studies_are_valid_at_every_scale(name: str):
     assert list(file["scale"]) == ["quick", "full"]
 
 
+@pytest.mark.parametrize("name", sorted(included_studies()))
+def test_cells_of_included_studies_can_be_compared(name: str):
+    file = read_toml(included_studies()[name])
+    for scale in file["scale"]:
+        asked: dict[str, set[tuple[Any, ...]]] = {}
+        for cell in parse_study(file, scale).cells:
+            asked.setdefault(cell.task, set()).add((cell.split, cell.scenarios, cell.evaluation_seeds))
+        assert [task for task, questions in asked.items() if len(questions) > 1] == []
+
+
 def test_a_cell_survives_its_file(tmp_path: Path):
     group = {"environment": {"reward": [1.0, 0.5, 0.25]}, "hyperparameters": {"actor_layers": [8]}}
     (cell,) = parse_study(contents(group=group)).cells
