@@ -10,7 +10,7 @@ import pytest
 from sample_results import TASK, curve, result
 from test_report import Page
 
-from rl2grid.analysis import section
+from rl2grid.analysis import results_page, section
 from rl2grid.analysis.results_page import write_results_page
 from rl2grid.analysis.sources import Sources
 from rl2grid.analysis.training import TrainingRun
@@ -87,6 +87,16 @@ def test_runs_alone_make_a_page(tmp_path):
     assert "id=ranking" not in text
     assert "id=episodes" not in text
     assert "rl2grid train" in text
+
+
+def test_many_figures_are_folded_by_task(tmp_path, monkeypatch):
+    sources = Sources(RESULTS, [RUN])
+    number = len(section.plan_section(RESULTS, [RUN]).pictures)
+    assert "<summary>bus14-T0: " not in write(tmp_path, sources)
+    monkeypatch.setattr(results_page, "UNFOLDED", number - 1)
+    text = write(tmp_path, sources)
+    assert f"<summary>bus14-T0: {number} figures</summary>" in text
+    assert text.count("<figure>") == number
 
 
 def test_figures_shrink_until_the_page_fits(tmp_path):

@@ -31,11 +31,14 @@ from rl2grid.analysis.section import Picture, Section, plan_section
 from rl2grid.analysis.sources import Sources
 from rl2grid.analysis.training import TrainingRun
 from rl2grid.drawing.theme import DARK, LIGHT
+from rl2grid.envs.tasks import short_id
 
 MAX_BYTES = 20_000_000
 """Of a page; figures of a larger one are made smaller."""
 SMALLEST = 0.4
 """Of their resolution."""
+UNFOLDED = 60
+"""Figures that stand one below the other; more are folded by task."""
 
 
 @dataclass(frozen=True)
@@ -161,8 +164,24 @@ def _tables(section: Section) -> list[str]:
 
 
 def _figures(drawn: Sequence[_Drawn]) -> list[str]:
-    parts = [figure_html(one.picture.caption, one.light, one.dark, _made_by(one.picture.task)) for one in drawn]
-    return ["<h2 id=figures>Figures</h2>", *parts] if parts else []
+    """All figures; folded by task where they are many."""
+    if not drawn:
+        return []
+    if len(drawn) <= UNFOLDED:
+        return ["<h2 id=figures>Figures</h2>", *map(_figure, drawn)]
+    by_task: dict[str, list[_Drawn]] = {}
+    for one in drawn:
+        by_task.setdefault(one.picture.task, []).append(one)
+    folded = [
+        f"<details><summary>{html.escape(short_id(task) or 'Several tasks')}: {len(group)} figures</summary>"
+        f"{''.join(map(_figure, group))}</details>"
+        for task, group in by_task.items()
+    ]
+    return [f"<section><h2 id=figures>Figures</h2>{''.join(folded)}</section>"]
+
+
+def _figure(drawn: _Drawn) -> str:
+    return figure_html(drawn.picture.caption, drawn.light, drawn.dark, _made_by(drawn.picture.task))
 
 
 def _commands(sources: Sources, command: str, train_commands: Mapping[Path, str]) -> str:
