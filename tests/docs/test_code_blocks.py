@@ -60,7 +60,7 @@ def test_commands_exist_with_their_flags(block, line, monkeypatch):
         monkeypatch.setattr(runs, "train", begin)
         monkeypatch.setattr(runs, "resume", begin)
         monkeypatch.setattr(runs, "read_config", lambda folder: (None, {}))
-        monkeypatch.setattr(validation, "validator", lambda args: None)
+        monkeypatch.setattr(validation, "find_validator", lambda args: None)
         with pytest.raises(TrainingBeginsError):
             command_line.main(arguments)
         return
