@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import uuid
 from collections.abc import Callable, Iterator, Mapping
@@ -63,7 +64,7 @@ def tracked(folder: Path, project: str | None, config: Mapping[str, Any]) -> Ite
 
 def _wandb() -> Any:
     try:
-        import wandb
+        wandb: Any = importlib.import_module("wandb")
     except ImportError:
         wandb = None
     # A folder called wandb, as Weights & Biases leaves behind, can be imported as well.
