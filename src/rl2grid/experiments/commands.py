@@ -11,7 +11,7 @@ from rl2grid.experiments import runs
 from rl2grid.experiments.flags import environment_flags, flags
 
 
-def train_command(args: runs.RunArgs, preset: str = "default") -> str:
+def train_command(args: runs.RunArgs, preset: str = "default", folder: Path | None = None) -> str:
     """The shortest ``rl2grid train`` that makes a run again: everything that its preset does not say.
 
     The number of PyTorch's threads and the device are in it, because results are the same bit for bit for these only;
@@ -20,6 +20,7 @@ def train_command(args: runs.RunArgs, preset: str = "default") -> str:
     Args:
         args: the run.
         preset: where its hyperparameters came from.
+        folder: to write it to; None: the usual one.
     """
     words = ["rl2grid", "train", args.algorithm, short_id(args.task)]
     words += ["--preset", preset] if preset != "default" else []
@@ -30,6 +31,7 @@ def train_command(args: runs.RunArgs, preset: str = "default") -> str:
         words += ["--evaluate-every", str(args.evaluate_every)]
     if args.validation_months is not None:
         words += ["--validation-months", str(args.validation_months)]
+    words += [] if folder is None else ["--folder", str(folder)]
     return shlex.join(words)
 
 
@@ -40,4 +42,4 @@ def training_command(folder: Path) -> str:
         UsageError: the folder holds no run.
     """
     args, _ = runs.read_config(folder)
-    return f"{train_command(args)} {shlex.join(('--folder', str(folder)))}"
+    return train_command(args, folder=folder)

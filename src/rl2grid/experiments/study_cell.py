@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import json
 import os
-import shlex
 import signal
 import subprocess
 import sys
@@ -105,8 +104,8 @@ def commands(folder: Path, cell: Cell) -> list[str]:
     keywords, lines, agent = {"heuristic": cell.heuristic, **cell.environment}, [], cell.agent
     if cell.training is not None:
         run = folder / RUN_FOLDER
-        train = train_command(_run_args(cell, cell.training, run), cell.training.preset)
-        lines, agent = [f"{train} {shlex.join(('--folder', str(run)))}"], str(run)
+        lines = [train_command(_run_args(cell, cell.training, run), cell.training.preset, run)]
+        agent = str(run)
     return [*lines, evaluate_command(agent, cell.task, cell.split, cell.evaluation_seeds, cell.months, keywords)]
 
 
