@@ -10,7 +10,7 @@ import numpy as np
 from rl2grid.analysis.episodes import Episode
 from rl2grid.analysis.results import EvaluationResult, check_comparable
 from rl2grid.analysis.statistics import Scores, Unit
-from rl2grid.analysis.summary import by_scenario
+from rl2grid.analysis.summary import by_scenario, safe_episodes
 from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
 from rl2grid.mdp.constraints import THRESHOLDS
@@ -74,7 +74,8 @@ class Method:
 
     def safe(self, constraint: str) -> Scores:
         """1 for episodes that were completed as well: dying early is not safety."""
-        return Scores(self.within(constraint).values * self.scores("completed").values)
+        limits = {constraint: THRESHOLDS[constraint]}
+        return Scores(np.stack([safe_episodes(result.episodes, limits) for result in self.results]))
 
 
 def method_label(episode: Episode) -> str:
