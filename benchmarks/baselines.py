@@ -12,13 +12,13 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from rl2grid.algorithms.policy_agent import load_agent
+from rl2grid.analysis.files import write_json
 from rl2grid.analysis.results import EvaluationResult, identity_hash
 from rl2grid.analysis.statistics import Estimate
 from rl2grid.analysis.training import read_training_run, read_validations
@@ -138,10 +138,7 @@ def read_ledger() -> dict[str, Any]:
 
 def enter(digest: str, entry: Mapping[str, Any]) -> None:
     """Add an entry."""
-    entries = {**read_ledger(), digest: dict(entry)}
-    temporary = LEDGER.with_suffix(".tmp")
-    temporary.write_text(json.dumps(entries, indent=1) + "\n", encoding="utf-8")
-    os.replace(temporary, LEDGER)
+    write_json(LEDGER, {**read_ledger(), digest: dict(entry)}, indent=1)
 
 
 def table() -> str:

@@ -8,12 +8,11 @@ second, and the share of the time spent in the environments.
 from __future__ import annotations
 
 import argparse
-import json
-import os
 import time
 from pathlib import Path
 from typing import Any
 
+from rl2grid.analysis.files import write_json
 from rl2grid.experiments.runs import ALGORITHMS, RunArgs, hyperparameters, make_envs
 
 RESULTS = Path(__file__).resolve().parent / "results" / "loop_speed.json"
@@ -72,9 +71,7 @@ def main() -> None:
         name = f"{algorithm} {task} {heuristic or 'plain'}"
         results[name] = measure(algorithm, task, heuristic, arguments.seconds)
         print(name, results[name], flush=True)
-    temporary = RESULTS.with_suffix(".tmp")
-    temporary.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
-    os.replace(temporary, RESULTS)
+    write_json(RESULTS, results, indent=1)
 
 
 if __name__ == "__main__":

@@ -33,6 +33,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 import rl2grid
 from rl2grid.algorithms.policy_agent import CHECKPOINT_FILE, load_agent
+from rl2grid.analysis.files import write_text
 from rl2grid.engines.differential import CAUSES, TOLERANCES, SideBySide
 from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.engines.probes import PROBES, Probe, make_probe
@@ -341,9 +342,7 @@ def write(result: dict[str, Any], path: Path) -> None:
         else:
             blocks.append(f" {json.dumps(key)}: {json.dumps(value)}")
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(".tmp")
-    temporary.write_text("{\n" + ",\n".join(blocks) + "\n}\n")
-    os.replace(temporary, path)
+    write_text(path, "{\n" + ",\n".join(blocks) + "\n}\n")
 
 
 def main() -> int:
