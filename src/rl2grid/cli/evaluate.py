@@ -24,8 +24,6 @@ def run(options: argparse.Namespace) -> int:
     """
     task = find_task(options.task)
     chosen = keywords.given(options)
-    if options.heuristic is not None:
-        chosen["heuristic"] = None if options.heuristic == "None" else options.heuristic
     output: Path = options.output or _default_output(options, task.id.removeprefix("rl2grid/"), chosen)
     result = evaluate(
         options.agent,

@@ -5,16 +5,17 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from rl2grid.engines import DISPATCHES, ENGINES
+from rl2grid.engines import DISPATCHES, ENGINES, HEURISTICS
 from rl2grid.envs.tasks import CONSTRAINTS
 
-NAMES = ("constraint", "engine", "reward", "normalize", "dispatch", "maintenance", "opponent")
+NAMES = ("heuristic", "constraint", "engine", "reward", "normalize", "dispatch", "maintenance", "opponent")
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add a flag for each of :data:`NAMES`; those that are not given leave no trace."""
     add = parser.add_argument_group("environment").add_argument
     without = argparse.SUPPRESS
+    add("--heuristic", default=without, choices=("None", *HEURISTICS), help="by default the agent's own")
     add("--constraint", default=without, choices=("None", *CONSTRAINTS), help="for tasks whose id names none")
     add("--engine", default=without, choices=ENGINES, help="native (default), or Grid2Op itself")
     add("--reward", default=without, metavar="REWARD", help="default, paper, released, or weights such as 1,0.5,0")

@@ -15,7 +15,6 @@ from typing import NoReturn
 from rl2grid import __version__
 from rl2grid.cli import actions, analyse, data, keywords, leaderboard, report, study, watch
 from rl2grid.cli.train import INTERRUPTED, train
-from rl2grid.engines import HEURISTICS
 from rl2grid.errors import UsageError
 from rl2grid.scenarios.splits import SPLITS
 
@@ -114,7 +113,6 @@ def _add_evaluate(commands: argparse._SubParsersAction[_Parser]) -> None:
     parser.add_argument("--split", default="validation", choices=SPLITS, help="validation picks models; test is last")
     parser.add_argument("--months", type=int, default=None, help="of the split, evenly spread; by default all")
     parser.add_argument("--seeds", type=int, default=1, help="episodes per scenario, with seeds 0, 1, ...")
-    parser.add_argument("--heuristic", default=None, choices=("None", *HEURISTICS), help="by default the agent's own")
     keywords.add_flags(parser)
     parser.add_argument(
         "--workers", type=int, default=None, help="processes; by default this one (native) or one per core (reference)"

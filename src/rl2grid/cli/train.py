@@ -130,7 +130,7 @@ def _begin(algorithm: str, task_id: str, flags: list[str]) -> int:
     _refuse_unknown(flags, [*fields(TrainFlags), *fields(chosen.args)])
     own, hyperparameters = _parse_both(f"rl2grid train {algorithm} {task.id}", flags, hyperparameters)
     limit = TimeLimit(own.max_minutes)
-    keywords = {name: getattr(own, name) for name in ("heuristic", "scenario", *NAMES)}
+    keywords = {name: getattr(own, name) for name in ("scenario", *NAMES)}
     keywords["reward"] = reward_of(own.reward)
     TaskOptions(**keywords)
     args = runs.RunArgs(

@@ -9,8 +9,6 @@ from typing import Any
 
 from rl2grid.envs.tasks import TaskOptions, short_id
 
-_GIVEN_OTHERWISE = ("heuristic", "split")
-
 
 def flags(values: Mapping[str, Any]) -> list[str]:
     """Flags that set values, by name."""
@@ -49,5 +47,4 @@ def evaluate_command(
     words = ["rl2grid", "evaluate", agent, short_id(task_id), "--split", split, "--seeds", str(seeds)]
     words += [] if months is None else ["--months", str(months)]
     words += ["--heuristic", str(keywords["heuristic"])] if "heuristic" in keywords else []
-    others = {name: value for name, value in keywords.items() if name not in _GIVEN_OTHERWISE}
-    return shlex.join([*words, *environment_flags(others)])
+    return shlex.join([*words, *environment_flags({**keywords, "heuristic": None})])
