@@ -149,7 +149,7 @@ def test_each_method_alone_and_in_the_dark_can_be_drawn():
 
 
 def test_labels_make_names_of_files_that_can_be_and_differ(tmp_path):
-    labels = ("PPO w/o masks", "PPO w-o masks", "ppo W/O masks")
+    labels = ("PPO w/o masks", "PPO w-o masks", "ppo W/O masks", "PPO w-o masks 2")
     names = [one.name for one in plan_section([result(label, [[0.5], [1.0]]) for label in labels]).pictures]
     assert len({name.lower() for name in names}) == len(names)
     for name in names:

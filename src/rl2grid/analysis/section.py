@@ -10,7 +10,6 @@
 from __future__ import annotations
 
 import re
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -191,11 +190,14 @@ def _file_name(label: str) -> str:
 
 def _distinct(pictures: Iterable[Picture]) -> Iterator[Picture]:
     """The pictures, those with the name of an earlier one numbered: labels may differ in what names of files lack."""
-    seen: Counter[str] = Counter()
+    taken: set[str] = set()
     for picture in pictures:
-        seen[picture.name.lower()] += 1
-        number = seen[picture.name.lower()]
-        yield picture if number == 1 else replace(picture, name=f"{picture.name}-{number}")
+        name, number = picture.name, 1
+        while name.lower() in taken:
+            number += 1
+            name = f"{picture.name}-{number}"
+        taken.add(name.lower())
+        yield replace(picture, name=name)
 
 
 def _of_methods(name: str, place: str, methods: Sequence[Method], words: str, draw: Callable[..., Figure]) -> Picture:
