@@ -169,14 +169,14 @@ def test_equals_the_reference_engine(task, heuristic):
 
 @pytest.mark.parametrize("task", TASKS)
 def test_batch_size_order_and_threads_do_not_matter(task):
-    seeds = list(range(40))
+    seeds = list(range(24))
     keywords = {"heuristic": "idle"}
-    together = play(make_vector(task, 40, num_threads=1, **keywords), seeds, 12)
-    threads = play(make_vector(task, 40, num_threads=4, **keywords), seeds, 12)
+    together = play(make_vector(task, 24, num_threads=1, **keywords), seeds, 8)
+    threads = play(make_vector(task, 24, num_threads=4, **keywords), seeds, 8)
     for mine, theirs in zip(threads, together, strict=True):
         assert_same(mine, theirs)
-    chosen = [17, 2, 39]
-    few = play(make_vector(task, 3, **keywords), chosen, 12)
+    chosen = [17, 2, 23]
+    few = play(make_vector(task, 3, **keywords), chosen, 8)
     for mine, theirs in zip(few, together, strict=True):
         for array, whole in zip(mine[:-1], theirs[:-1], strict=True):
             np.testing.assert_array_equal(array, whole[chosen])
