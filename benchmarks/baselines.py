@@ -4,7 +4,8 @@
 policy by validation) or an agent without training as ``greedy@bus14-T0`` or ``random@bus14-T0:idle``, and enters the
 result in ``benchmarks/results/baselines.json``. A configuration (task, algorithm, hyperparameters, seed, keywords of
 the environment) that is in the ledger is not played again: what was chosen after looking at test results is no test.
-``python benchmarks/baselines.py table`` prints the ledger as Markdown.
+``python benchmarks/baselines.py verify SUBJECT ...`` plays them again and says whether policy and episodes are those of
+the ledger, bit for bit; ``python benchmarks/baselines.py table`` prints the ledger as Markdown.
 """
 
 from __future__ import annotations
@@ -141,6 +142,22 @@ def enter(digest: str, entry: Mapping[str, Any]) -> None:
     write_json(LEDGER, {**read_ledger(), digest: dict(entry)}, indent=1)
 
 
+def verify(chosen: Subject) -> list[str]:
+    """Play the test months of an entry again; the names of what differs from the ledger.
+
+    Raises:
+        UsageError: the ledger has no such entry.
+    """
+    entry = read_ledger().get(chosen.digest)
+    if entry is None:
+        raise UsageError(f"The ledger has no test of {str(chosen.agent)!r} on {chosen.task} to compare with.")
+    again = test(chosen)
+    found = {name: again[name] == entry[name] for name in ("episodes_hash", "test")}
+    if chosen.training:
+        found["policy_hash"] = again["training"]["policy_hash"] == entry["training"]["policy_hash"]
+    return sorted(name for name, same in found.items() if not same)
+
+
 def table() -> str:
     """The ledger as Markdown: a row per configuration, its seeds together; tasks in order, trained agents last."""
     lines = [
@@ -206,20 +223,38 @@ def _heuristic(configuration: Mapping[str, Any]) -> str | None:
     return chosen
 
 
-def main() -> None:
+def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("command", choices=("test", "table"))
+    parser.add_argument("command", choices=("test", "verify", "table"))
     parser.add_argument("subjects", nargs="*")
     arguments = parser.parse_args()
     if arguments.command == "table":
         print(table())
-        return
-    for chosen in [subject(text) for text in arguments.subjects]:
+        return 0
+    try:
+        subjects = [subject(text) for text in arguments.subjects]
+        return _verify_all(subjects) if arguments.command == "verify" else _test_all(subjects)
+    except UsageError as error:
+        parser.exit(2, f"{error}\n")
+
+
+def _test_all(subjects: Sequence[Subject]) -> int:
+    for chosen in subjects:
         if chosen.digest in read_ledger():
             print(f"{chosen.agent} on {chosen.task} has had its test: see {LEDGER.name}.")
             continue
         enter(chosen.digest, test(chosen))
+    return 0
+
+
+def _verify_all(subjects: Sequence[Subject]) -> int:
+    found = []
+    for chosen in subjects:
+        found.append(verify(chosen))
+        words = f"differs in {', '.join(found[-1])}" if found[-1] else "the same, bit for bit"
+        print(f"{chosen.agent} on {short_id(chosen.task)}, heuristic {chosen.heuristic}: {words}.", flush=True)
+    return 1 if any(found) else 0
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(main())
