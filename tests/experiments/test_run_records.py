@@ -93,7 +93,9 @@ def test_energy_spent_before_a_crash_is_not_lost(tmp_path: Path):
     assert account(tmp_path / "run")["cpu_seconds"] > 0.0
 
 
-def test_codecarbons_figures_are_taken_where_it_is_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def give_codecarbon(monkeypatch: pytest.MonkeyPatch, place: tuple[float, float]) -> None:
+    """A CodeCarbon that finds itself in a place, and measures 2.5 kWh and 0.125 kg."""
+
     class Tracker:
         def __init__(self, **options: Any) -> None:
             assert options["output_methods"] == []  # no files outside the run folder
@@ -102,20 +104,33 @@ def test_codecarbons_figures_are_taken_where_it_is_installed(tmp_path: Path, mon
             pass
 
         def stop(self) -> float:
-            self.final_emissions_data = SimpleNamespace(energy_consumed=2.5)
+            latitude, longitude = place
+            self.final_emissions_data = SimpleNamespace(energy_consumed=2.5, latitude=latitude, longitude=longitude)
             return 0.125
 
-    train(request(tmp_path / "run"), limit=Over(), make_envs=toy_envs)
-    estimated = account(tmp_path / "run")
     module = ModuleType("codecarbon")
     module.EmissionsTracker = Tracker  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "codecarbon", module)
+
+
+def test_codecarbons_figures_are_taken_where_it_is_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    train(request(tmp_path / "run"), limit=Over(), make_envs=toy_envs)
+    estimated = account(tmp_path / "run")
+    give_codecarbon(monkeypatch, (46.8131, -71.2075))
     resume(tmp_path / "run", make_envs=toy_envs)
     whole = account(tmp_path / "run")
     assert whole["method"] == "codecarbon and estimate"
     assert whole["parts"][1]["method"] == "codecarbon"
     assert whole["energy_kwh"] == pytest.approx(2.5 + estimated["energy_kwh"], rel=1e-12)
     assert whole["co2_kg"] == pytest.approx(0.125 + estimated["co2_kg"], rel=1e-12)
+
+
+def test_co2_is_the_worlds_mean_where_codecarbon_does_not_know_the_place(tmp_path: Path, monkeypatch):
+    give_codecarbon(monkeypatch, (46.8, -71.2))
+    whole = account(train(request(tmp_path / "run"), make_envs=toy_envs))
+    assert whole["method"] == "codecarbon, the world's mean CO2"
+    assert whole["energy_kwh"] == 2.5
+    assert whole["co2_kg"] == pytest.approx(2.5 * 0.475, rel=1e-12)
 
 
 def test_a_codecarbon_that_does_not_work_ends_no_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

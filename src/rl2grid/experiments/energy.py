@@ -5,8 +5,9 @@ installed; else, and for processes that were killed, they are estimated:
 
     energy = processor seconds x WATTS_PER_CORE          CO2 = energy x CO2_PER_KWH
 
-The estimate counts busy cores only: no memory, no graphics card, no cooling. Of a process that was killed, what came
-after its last checkpoint is missing.
+CodeCarbon looks up where the machine is. Where it cannot (no internet) it assumes a place that lives on hydropower: its
+energy is taken then, and ``CO2_PER_KWH``. The estimate counts busy cores only: no memory, no graphics card, no cooling.
+Of a process that was killed, what came after its last checkpoint is missing.
 """
 
 from __future__ import annotations
@@ -26,6 +27,12 @@ WATTS_PER_CORE = 12.0
 """Power of a busy core in W: an assumption, thermal design power by number of cores of common processors."""
 CO2_PER_KWH = 0.475
 """kg per kWh: the world's electricity in 2018 (IEA, Global Energy & CO2 Status Report 2019)."""
+
+_UNKNOWN_PLACE = (46.8, -71.2)
+"""Latitude and longitude that CodeCarbon assumes if it cannot look them up (its ``GeoMetadata.from_geo_js``)."""
+
+_PLACE_ASSUMED = "codecarbon, the world's mean CO2"
+"""Method of a part whose energy is CodeCarbon's."""
 
 _ASSUMPTIONS = {
     "watts_per_core": WATTS_PER_CORE,
@@ -115,7 +122,10 @@ def _measured(tracker: Any) -> dict[str, Any]:
         return {}
     try:
         co2 = tracker.stop()
-        energy = tracker.final_emissions_data.energy_consumed
-        return {"method": "codecarbon", "energy_kwh": float(energy), "co2_kg": float(co2)}
+        data = tracker.final_emissions_data
+        energy, place = float(data.energy_consumed), (data.latitude, data.longitude)
+        if place == _UNKNOWN_PLACE:
+            return {"method": _PLACE_ASSUMED, "energy_kwh": energy, "co2_kg": energy * CO2_PER_KWH}
+        return {"method": "codecarbon", "energy_kwh": energy, "co2_kg": float(co2)}
     except Exception:  # no reason to end a training
         return {}
