@@ -100,10 +100,12 @@ def test_tables_name_the_best():
     assert lines[0] == "| " + " | ".join(HEADINGS) + " |"
     console = Console(width=80)
     with console.capture() as captured:
-        console.print(rich_table([*summaries, result("do-nothing", [[0.5, 0.1]], "idle").summary], "Results"))
+        others = [result("do-nothing", [[0.5, 0.1]], "idle"), result("lagrangian-ppo-of-mine", [[0.5]], "recovery")]
+        console.print(rich_table([*summaries, *(other.summary for other in others)], "Results"))
     text = captured.get()
     assert "0.950 [0.900, 1.000]" in text
     assert "do-nothing + idle" in text
+    assert "survival  done  return  cost   LSI  cost   TLO" in text
     assert "…" not in text
     assert max(map(len, text.splitlines())) <= 80
 

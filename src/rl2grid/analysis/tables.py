@@ -190,7 +190,7 @@ def table_cells(summary: Summary) -> list[str]:
 
 
 def rich_table(summaries: Sequence[Summary], title: str | None = None) -> Table:
-    """A table for the terminal, 80 characters wide with names of usual length; the best survival is bold.
+    """A table for the terminal, 80 characters wide: long names are folded; the best survival is bold.
 
     "Done" is the share of episodes completed.
     """
@@ -202,7 +202,7 @@ def rich_table(summaries: Sequence[Summary], title: str | None = None) -> Table:
         pad_edge=False,
         padding=(0, 1, 0, 0),
     )
-    table.add_column("agent", no_wrap=True)
+    table.add_column("agent", overflow="fold")
     for heading in ("survival", "done", "return", "LSI\ncost", "safe\nLSI", "TLO\ncost", "safe\nTLO"):
         table.add_column(heading, justify="right", no_wrap=True)
     for summary in summaries:
