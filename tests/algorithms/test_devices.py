@@ -1,47 +1,38 @@
-"""Networks on another device than the environments, where there is no GPU.
+"""Which device is taken, and networks on another one than the environments, where there is no GPU.
 
-They are put on PyTorch's device ``meta``. It knows shapes and no numbers, but refuses to compute with tensors of two
-devices, as a GPU does. What comes back from it is made up: ones, zeros and "no". Tests with a GPU are in the
+Networks are put on PyTorch's device ``meta``. It knows shapes and no numbers, but refuses to compute with tensors of
+two devices, as a GPU does. What comes back from it is made up: ones, zeros and "no". Tests with a GPU are in the
 algorithms' own files.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
+import test_lagrangian_ppo
+import test_off_policy
+import test_ppo
 import torch
 import toy_grid
-from test_lagrangian_ppo import SMALL as SMALL_LAGRANGIAN
-from test_lagrangian_ppo import CostlyToyGrid
 from torch import Tensor
 from torch.fx.experimental import _config as shapes
 
-from rl2grid.algorithms import dqn, lagrangian_ppo, off_policy, ppo, sac, td3
-
-SIZES: dict[str, Any] = {"total_timesteps": 4 * 16 * 4, "num_envs": 4, "num_steps": 16}
-OFF_POLICY: dict[str, Any] = {**SIZES, "learning_starts": 40, "batch_size": 16}
-LAYERS: dict[str, Any] = {"actor_layers": (8,), "critic_layers": (8,)}
-
-
-def discrete() -> toy_grid.ToyGrid:
-    return toy_grid.ToyGrid(4)
-
-
-def continuous() -> toy_grid.ToyGrid:
-    return toy_grid.ToyGrid(4, continuous=True)
-
+from rl2grid.algorithms import lagrangian_ppo, off_policy, ppo
+from rl2grid.algorithms.devices import find_device
+from rl2grid.errors import UsageError
 
 TRAINERS: dict[str, Callable[[], Any]] = {
-    "dqn": lambda: dqn.DQN(dqn.Args(**OFF_POLICY, layers=(8,), networks=2, head="dueling"), discrete()),
-    "sac-discrete": lambda: sac.SAC(sac.Args(**OFF_POLICY, **LAYERS), discrete()),
-    "sac-continuous": lambda: sac.SAC(sac.Args(**OFF_POLICY, **LAYERS, mask_actions=False), continuous()),
-    "td3": lambda: td3.TD3(td3.Args(**OFF_POLICY, **LAYERS), continuous()),
-    "ppo-discrete": lambda: ppo.PPO(ppo.Args(**SIZES, **LAYERS), discrete()),
-    "ppo-continuous": lambda: ppo.PPO(ppo.Args(**SIZES, **LAYERS, mask_actions=False), continuous()),
-    "lagrangian-ppo": lambda: lagrangian_ppo.LagrangianPPO(SMALL_LAGRANGIAN, CostlyToyGrid(4)),
+    **{kind: partial(test_off_policy.trainer, kind) for kind in test_off_policy.MADE},
+    "dqn-dueling": partial(test_off_policy.trainer, "dqn", networks=2, head="dueling"),
+    "ppo-discrete": test_ppo.trainer,
+    "ppo-continuous": partial(test_ppo.trainer, continuous=True),
+    "lagrangian-ppo-discrete": test_lagrangian_ppo.trainer,
+    "lagrangian-ppo-continuous": partial(test_lagrangian_ppo.trainer, continuous=True),
 }
 
 
@@ -83,3 +74,18 @@ def test_tensors_of_two_devices_never_meet(name: str):
 def parameters(trainer: Any) -> list[Tensor]:
     network = trainer.policy()[0] if isinstance(trainer, off_policy.OffPolicyTrainer) else trainer.network
     return list(network.parameters())
+
+
+def test_a_gpu_is_taken_if_there_is_one_and_refused_if_not(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.delenv("CUBLAS_WORKSPACE_CONFIG", raising=False)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert find_device("auto").type == find_device("cpu").type == "cpu"
+    with pytest.raises(UsageError, match="finds no CUDA device here: set device to cpu or auto"):
+        find_device("cuda")
+    assert "CUBLAS_WORKSPACE_CONFIG" not in os.environ
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    assert find_device("cpu").type == "cpu"
+    for name in ("auto", "cuda"):
+        monkeypatch.delenv("CUBLAS_WORKSPACE_CONFIG", raising=False)
+        assert find_device(name).type == "cuda"
+        assert os.environ["CUBLAS_WORKSPACE_CONFIG"] == ":4096:8"  # what deterministic cuBLAS asks for
