@@ -8,8 +8,9 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import SyncVectorEnv
 from gymnasium.wrappers import RescaleAction
+from toy_tasks import vector
 
 from rl2grid.algorithms import dqn, sac, td3
 from rl2grid.algorithms.off_policy import OffPolicyTrainer
@@ -47,13 +48,12 @@ CARTPOLE: dict[str, Any] = {
 
 def cartpole(num_envs: int) -> SyncVectorEnv:
     """A pole on a cart, a reward of 1 per step; given up after 500 steps. At random it falls after some 20."""
-    return SyncVectorEnv([lambda: gymnasium.make("CartPole-v1")] * num_envs, autoreset_mode=AutoresetMode.SAME_STEP)
+    return vector(lambda: gymnasium.make("CartPole-v1"), num_envs)
 
 
 def pendulum(num_envs: int) -> SyncVectorEnv:
     """With the torque as a share of the largest."""
-    makers = [lambda: RescaleAction(gymnasium.make("Pendulum-v1"), np.float32(-1.0), np.float32(1.0))] * num_envs
-    return SyncVectorEnv(makers, autoreset_mode=AutoresetMode.SAME_STEP)
+    return vector(lambda: RescaleAction(gymnasium.make("Pendulum-v1"), np.float32(-1.0), np.float32(1.0)), num_envs)
 
 
 def mean_return(trainer: OffPolicyTrainer, envs: SyncVectorEnv) -> float:
