@@ -152,10 +152,10 @@ def verify(chosen: Subject) -> list[str]:
     if entry is None:
         raise UsageError(f"The ledger has no test of {str(chosen.agent)!r} on {chosen.task} to compare with.")
     again = test(chosen)
-    found = {name: again[name] == entry[name] for name in ("episodes_hash", "test")}
-    if chosen.training:
-        found["policy_hash"] = again["training"]["policy_hash"] == entry["training"]["policy_hash"]
-    return sorted(name for name, same in found.items() if not same)
+    differing = [name for name in ("episodes_hash", "test") if again[name] != entry[name]]
+    if chosen.training and chosen.training["policy_hash"] != entry["training"]["policy_hash"]:
+        differing.append("policy_hash")
+    return differing
 
 
 def table() -> str:
