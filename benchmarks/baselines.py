@@ -19,16 +19,16 @@ from pathlib import Path
 from typing import Any
 
 from rl2grid.algorithms.policy_agent import load_agent
-from rl2grid.analysis.files import write_json
-from rl2grid.analysis.results import EvaluationResult, identity_hash
-from rl2grid.analysis.statistics import Estimate
-from rl2grid.analysis.training import read_training_run, read_validations
 from rl2grid.envs.tasks import find_task, short_id
 from rl2grid.errors import UsageError
-from rl2grid.experiments.commands import train_command
-from rl2grid.experiments.evaluation import AS_TRAINED, evaluate
-from rl2grid.experiments.runs import is_finished, read_config
-from rl2grid.experiments.study_cell import trained_seconds
+from rl2grid.evaluation.protocol import AS_TRAINED, evaluate
+from rl2grid.records.evaluations import EvaluationResult, identity_hash
+from rl2grid.records.files import write_json
+from rl2grid.records.statistics import Estimate
+from rl2grid.records.trainings import read_training_run, read_validations
+from rl2grid.studies.cell import trained_seconds
+from rl2grid.training.commands import train_command
+from rl2grid.training.runs import is_finished, read_config
 
 LEDGER = Path(__file__).resolve().parent / "results" / "baselines.json"
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from rl2grid.agents.do_nothing import DoNothing
 from rl2grid.agents.greedy import Greedy
-from rl2grid.experiments.evaluation import evaluate
+from rl2grid.evaluation.protocol import evaluate
 from rl2grid.grids import load_grid
 from rl2grid.grids.rankings import ranking_hash
 from rl2grid.mdp.actions import level_ids

@@ -12,8 +12,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from rl2grid.analysis.files import write_json
-from rl2grid.experiments.runs import ALGORITHMS, RunArgs, hyperparameters, make_envs
+from rl2grid.records.files import write_json
+from rl2grid.training.runs import ALGORITHMS, RunArgs, hyperparameters, make_envs
 
 RESULTS = Path(__file__).resolve().parent / "results" / "loop_speed.json"
 LOOPS: tuple[tuple[str, str, str | None], ...] = (

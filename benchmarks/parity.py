@@ -33,22 +33,22 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 import rl2grid
 from rl2grid.algorithms.policy_agent import CHECKPOINT_FILE, load_agent
-from rl2grid.analysis.files import write_text
 from rl2grid.engines.differential import CAUSES, TOLERANCES, SideBySide
 from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.engines.probes import PROBES, Probe, make_probe
 from rl2grid.engines.reference.engine import ReferenceEngine
 from rl2grid.envs.player import single_spaces
 from rl2grid.envs.tasks import find_task
-from rl2grid.experiments import runs
 from rl2grid.grids import GRID_IDS, Grid, load_grid
 from rl2grid.mdp.actions import ActionKind, StepAction, legal_actions, level_catalogue
 from rl2grid.mdp.features import observation_size, observation_writer, physical_scale
 from rl2grid.mdp.state import GridState
+from rl2grid.records.files import write_text
+from rl2grid.records.versions import library_versions
 from rl2grid.scenarios.cache import data_folder
 from rl2grid.scenarios.episodes import EpisodePlan
 from rl2grid.scenarios.library import list_scenarios, load_scenario, scenario_pack_hash
-from rl2grid.versions import library_versions
+from rl2grid.training import runs
 
 PART_STEPS = 10_000
 """Steps of a part, the least that an interruption loses."""

@@ -15,7 +15,7 @@ import gymnasium
 import numpy as np
 
 import rl2grid  # noqa: F401 - registers the tasks
-from rl2grid.experiments.evaluation import evaluate
+from rl2grid.evaluation.protocol import evaluate
 from rl2grid.grids import GRID_IDS
 from rl2grid.scenarios.library import list_scenarios
 

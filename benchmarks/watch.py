@@ -19,9 +19,9 @@ from typing import Any
 import matplotlib
 
 from rl2grid.analysis import animation
-from rl2grid.analysis.recordings import Recording
-from rl2grid.experiments.watching import play_to_watch
+from rl2grid.evaluation.watching import play_to_watch
 from rl2grid.grids import load_grid
+from rl2grid.records.recordings import Recording
 from rl2grid.scenarios.library import list_scenarios
 
 RESULTS = Path(__file__).resolve().parent / "results" / "watch.json"

@@ -8,8 +8,8 @@ from typing import Any
 
 from sample_results import TASK, result
 
-from rl2grid.analysis.episodes import EPISODES_FILE, write_episodes
-from rl2grid.analysis.results import EVALUATION_FILE, write_evaluation
+from rl2grid.records.episodes import EPISODES_FILE, write_episodes
+from rl2grid.records.evaluations import EVALUATION_FILE, write_evaluation
 
 METRICS = "step,grid_steps,wall_time,name,value\n64,640,1.0,charts/survival,0.25\n128,1280,2.0,charts/survival,0.5\n"
 

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from rl2grid.analysis.episodes import Episode
-from rl2grid.analysis.recordings import Recording
-from rl2grid.analysis.results import EvaluationResult
-from rl2grid.analysis.training import Metric, TrainingCurve
+from rl2grid.records.episodes import Episode
+from rl2grid.records.evaluations import EvaluationResult
+from rl2grid.records.recordings import Recording
+from rl2grid.records.trainings import Metric, TrainingCurve
 
 TASK = "rl2grid/bus14-T0-v0"
 

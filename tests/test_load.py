@@ -15,7 +15,7 @@ import torch
 import rl2grid
 from rl2grid.algorithms.checkpoint import load_checkpoint
 from rl2grid.errors import UsageError
-from rl2grid.experiments.runs import RunArgs, hyperparameters, train
+from rl2grid.training.runs import RunArgs, hyperparameters, train
 
 
 def run_folder(folder: Path) -> Path:

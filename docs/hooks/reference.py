@@ -11,8 +11,8 @@ from mkdocs.structure.files import File, Files
 
 PACKAGE = Path(__file__).resolve().parents[2] / "src" / "rl2grid"
 LAYERS = (
-    "grids", "scenarios", "mdp", "engines", "envs", "agents", "algorithms", "drawing", "analysis", "experiments",
-    "powerflow", "cli",
+    "grids", "scenarios", "mdp", "engines", "envs", "records", "agents", "algorithms", "evaluation", "training",
+    "ledger", "studies", "drawing", "analysis", "powerflow", "cli",
 )  # fmt: skip
 """Packages, in the order of the menu."""
 

@@ -18,7 +18,10 @@ import platformdirs
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-INTERPRETED_LAYERS = ("agents", "algorithms", "analysis", "cli", "drawing", "envs", "experiments")
+INTERPRETED_LAYERS = (
+    "agents", "algorithms", "analysis", "cli", "drawing", "envs", "evaluation", "ledger", "records", "studies",
+    "training",
+)  # fmt: skip
 """Subpackages without compiled functions: an edit of them leaves the compiled ones what they are."""
 
 

@@ -12,7 +12,7 @@ from rl2grid.agents.dc_flow import buses, dc_flow, dc_point, sensitivities
 from rl2grid.agents.dc_opf import DcOpf, optimal_injections
 from rl2grid.agents.dispatch import Control, controls, encode
 from rl2grid.errors import UsageError
-from rl2grid.experiments.agents import make_agent
+from rl2grid.evaluation.agents import make_agent
 from rl2grid.mdp.actions import decode_continuous
 from rl2grid.powerflow.model import load_network
 

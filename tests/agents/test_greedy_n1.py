@@ -11,7 +11,7 @@ import rl2grid  # noqa: F401  (registers the tasks)
 from rl2grid.agents.greedy_topology import GreedyN1, effects, insecurity
 from rl2grid.envs.foresight import busbars_after
 from rl2grid.errors import UsageError
-from rl2grid.experiments.agents import make_agent
+from rl2grid.evaluation.agents import make_agent
 from rl2grid.grids import load_grid
 from rl2grid.mdp.actions import ActionKind, full_catalogue, level_catalogue
 from rl2grid.mdp.state import new_state

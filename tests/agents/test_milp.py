@@ -12,7 +12,7 @@ from rl2grid.agents.agent import Agent
 from rl2grid.agents.dc_flow import DcPoint, dc_flow, dc_point, is_connected
 from rl2grid.agents.milp import Milp, best_action
 from rl2grid.errors import UsageError
-from rl2grid.experiments.agents import make_agent
+from rl2grid.evaluation.agents import make_agent
 from rl2grid.grids import Grid, load_grid
 from rl2grid.mdp.actions import ActionCatalogue, ActionKind, full_catalogue, level_catalogue
 from rl2grid.powerflow.model import load_network

@@ -36,7 +36,7 @@ from rl2grid.algorithms.lagrangian_ppo import (
 from rl2grid.algorithms.policy_agent import PolicyAgent
 from rl2grid.envs.registration import register_all
 from rl2grid.errors import UsageError
-from rl2grid.experiments.runs import RunArgs, hyperparameters, is_finished, read_config, resume, train
+from rl2grid.training.runs import RunArgs, hyperparameters, is_finished, read_config, resume, train
 
 SMALL = Args(
     seed=3,

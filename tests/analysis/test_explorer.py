@@ -8,8 +8,8 @@ import pytest
 from sample_results import episode, result
 
 from rl2grid.analysis.explorer import explorer_data, explorer_html
-from rl2grid.analysis.results import EvaluationResult
 from rl2grid.mdp.termination import GAME_OVER_TEXT, GameOver
+from rl2grid.records.evaluations import EvaluationResult
 
 
 def column(data, name):

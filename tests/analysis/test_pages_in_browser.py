@@ -11,10 +11,10 @@ from sample_results import curve, result
 from test_watching import made_up
 
 from rl2grid.analysis.results_page import write_results_page
-from rl2grid.analysis.sources import Sources
-from rl2grid.analysis.training import TrainingRun
 from rl2grid.analysis.watch_page import write_watch_page
 from rl2grid.grids import load_grid
+from rl2grid.records.sources import Sources
+from rl2grid.records.trainings import TrainingRun
 
 pytestmark = pytest.mark.slow
 

@@ -9,7 +9,6 @@ import re
 import pytest
 from sample_results import TASK, result
 
-from rl2grid.analysis.methods import group_methods
 from rl2grid.analysis.result_tables import (
     aggregate_table,
     comparison_table,
@@ -19,7 +18,6 @@ from rl2grid.analysis.result_tables import (
     score_table,
     survival_table,
 )
-from rl2grid.analysis.statistics import Estimate
 from rl2grid.analysis.tables import (
     MISSING,
     Cell,
@@ -30,6 +28,8 @@ from rl2grid.analysis.tables import (
     table_latex,
     table_markdown,
 )
+from rl2grid.records.methods import group_methods
+from rl2grid.records.statistics import Estimate
 
 CONTINUOUS = "rl2grid/bus14-R-v0"
 METHODS = group_methods(

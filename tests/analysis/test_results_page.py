@@ -12,9 +12,9 @@ from test_report import Page
 
 from rl2grid.analysis import results_page, section
 from rl2grid.analysis.results_page import write_results_page
-from rl2grid.analysis.sources import Sources
-from rl2grid.analysis.training import TrainingRun
 from rl2grid.errors import UsageError
+from rl2grid.records.sources import Sources
+from rl2grid.records.trainings import TrainingRun
 
 RUN = TrainingRun(Path("runs/one"), TASK, {}, 1, curve())
 RESULTS = [

@@ -11,14 +11,14 @@ from sample_results import TASK, curve, result
 from rl2grid.analysis import comparison_figures as compare
 from rl2grid.analysis.ending_figures import count_endings, draw_ending_bars
 from rl2grid.analysis.figures import SMOOTHED_EPISODES
-from rl2grid.analysis.methods import group_methods
 from rl2grid.analysis.section import plan_section, results_section
-from rl2grid.analysis.statistics import bootstrap_band, episode_mean
-from rl2grid.analysis.training import TrainingRun
 from rl2grid.analysis.training_figures import COST_PANELS, SCORE_PANELS, draw_panels, logs
 from rl2grid.drawing.theme import DARK
 from rl2grid.errors import UsageError
 from rl2grid.grids import load_grid
+from rl2grid.records.methods import group_methods
+from rl2grid.records.statistics import bootstrap_band, episode_mean
+from rl2grid.records.trainings import TrainingRun
 
 RESULTS = [
     result("ppo", [[1.0], [0.9], [1.0]], "idle", agent_hash="a"),

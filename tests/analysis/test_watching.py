@@ -12,10 +12,10 @@ import pytest
 from PIL import Image
 
 from rl2grid.analysis.animation import caption_at, frames, write_animation
-from rl2grid.analysis.recordings import Recording
 from rl2grid.analysis.watch_page import intervals, page_data, topology_changes, write_watch_page
 from rl2grid.errors import UsageError
 from rl2grid.grids import load_grid
+from rl2grid.records.recordings import Recording
 
 BUS14 = load_grid("bus14")
 

@@ -10,7 +10,7 @@ import pytest
 from sample_folders import CELLS, write_made_up_study
 
 from rl2grid.cli.main import main
-from rl2grid.experiments.evaluation import evaluate
+from rl2grid.evaluation.protocol import evaluate
 
 
 @pytest.fixture(scope="module")

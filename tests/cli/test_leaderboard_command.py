@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from rl2grid.analysis.entries import FACTS, episode_hash
 from rl2grid.cli.main import main
-from rl2grid.experiments.evaluation import evaluate
+from rl2grid.evaluation.protocol import evaluate
+from rl2grid.records.entries import FACTS, episode_hash
 
 MONTH = "generated/700000-00"
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from rl2grid.algorithms import ppo
-from rl2grid.analysis.results import load_evaluation
 from rl2grid.cli.main import main
+from rl2grid.records.evaluations import load_evaluation
 
 
 def refused(capsys, *command_line):
@@ -98,7 +98,7 @@ def test_outputs_below_a_file_are_refused_before_anything_is_played(capsys, tmp_
     (tmp_path / "few.toml").write_text(tuning)
     command_line = [str(tmp_path / "few.toml") if word == "TUNING" else word for word in command_line]
     monkeypatch.setattr(ppo.PPO, "iterate", None)
-    monkeypatch.setattr("rl2grid.experiments.players.play_episode", None)
+    monkeypatch.setattr("rl2grid.evaluation.players.play_episode", None)
     sentence = refused(capsys, *command_line, str(tmp_path / "file" / "a" / "b"))
     assert "cannot be made" in sentence
 
@@ -109,7 +109,7 @@ def test_an_interrupt_at_once_tells_how_the_training_goes_on(capsys, tmp_path, m
             Path("runs/bus14-T0-v0-ppo-1").mkdir(parents=True)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("rl2grid.experiments.runs.train", interrupted)
+    monkeypatch.setattr("rl2grid.training.runs.train", interrupted)
     monkeypatch.chdir(tmp_path)
     assert main(["train", "ppo", "bus14-T0", "--seed", "1"]) == 130
     assert "go on with `rl2grid train --resume runs/bus14-T0-v0-ppo-1`" in capsys.readouterr().err
@@ -119,8 +119,8 @@ def test_an_interrupt_at_once_tells_how_the_training_goes_on(capsys, tmp_path, m
 
 def test_the_report_of_a_training_reads_its_checkpoint_once(capsys, monkeypatch):
     asked = []
-    monkeypatch.setattr("rl2grid.experiments.runs.train", lambda args, **_: Path("run"))
-    monkeypatch.setattr("rl2grid.experiments.runs.is_finished", asked.append)
+    monkeypatch.setattr("rl2grid.training.runs.train", lambda args, **_: Path("run"))
+    monkeypatch.setattr("rl2grid.training.runs.is_finished", asked.append)
     assert main(["train", "ppo", "bus14-T0"]) == 130
     assert asked == [Path("run")]
 

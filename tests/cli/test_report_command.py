@@ -16,7 +16,7 @@ def _no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rl2grid.analysis.section.evaluation_pictures", lambda methods: [])
     monkeypatch.setattr("rl2grid.analysis.section.training_pictures", lambda curves: [])
     # Made-up runs have no settings that a command could name.
-    monkeypatch.setattr("rl2grid.experiments.commands.training_command", lambda folder: f"rl2grid train for {folder}")
+    monkeypatch.setattr("rl2grid.training.commands.training_command", lambda folder: f"rl2grid train for {folder}")
 
 
 def test_a_study_becomes_a_page(tmp_path, capsys):

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from rl2grid.analysis.results import load_evaluation
-from rl2grid.analysis.training import RUN_FILE, read_training_run
 from rl2grid.cli.main import main
-from rl2grid.experiments.commands import training_command
-from rl2grid.experiments.leaderboard import find_evaluation, make_entry, verify_entry
-from rl2grid.experiments.runs import read_config
+from rl2grid.ledger.leaderboard import find_evaluation, make_entry, verify_entry
+from rl2grid.records.evaluations import load_evaluation
+from rl2grid.records.trainings import RUN_FILE, read_training_run
+from rl2grid.training.commands import training_command
+from rl2grid.training.runs import read_config
 
 TRAINING = [
     *("train", "ppo", "bus14-T0", "--heuristic", "idle", "--total-timesteps", "256", "--num-envs", "4", "--num-steps"),

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from rl2grid.analysis.files import write_json
 from rl2grid.cli.main import main
-from rl2grid.experiments import study_run
-from rl2grid.experiments.study_cell import FINISHED, CellResult
+from rl2grid.records.files import write_json
+from rl2grid.studies import run as study_run
+from rl2grid.studies.cell import FINISHED, CellResult
 
 STUDY = """
 name = "few"
@@ -88,7 +88,7 @@ def test_a_failed_cell_is_told_and_the_others_are_finished(capsys, file: str, tm
 
     monkeypatch.setattr(study_run, "_write_episodes", lambda path, states: path.write_text("cell\n"))
     monkeypatch.setattr(study_run, "_POLL_SECONDS", 0.01)
-    monkeypatch.setattr("rl2grid.experiments.study_backends.make_backend", lambda *_: Backend())
+    monkeypatch.setattr("rl2grid.studies.backends.make_backend", lambda *_: Backend())
     output = tmp_path / "out"
     assert main(["study", "run", file, "--output", str(output)]) == 1
     shown = capsys.readouterr().out

@@ -12,8 +12,8 @@ from documentation import PAGES, blocks, name_of
 
 from rl2grid.cli import main as command_line
 from rl2grid.envs.tasks import find_task
-from rl2grid.experiments import runs, validation
-from rl2grid.experiments.agents import AGENTS
+from rl2grid.evaluation.agents import AGENTS
+from rl2grid.training import runs, validation
 
 QUICK = (["tasks"], ["actions"], ["study", "list"], ["data", "list"])
 """Subcommands that are run as shown."""

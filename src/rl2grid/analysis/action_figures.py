@@ -26,13 +26,13 @@ from rl2grid.analysis.action_space import (
     topology_after,
     wilson_interval,
 )
-from rl2grid.analysis.statistics import Floats
 from rl2grid.drawing.grid_drawing import GridDrawing, add_legend, reference_scene
 from rl2grid.drawing.theme import LIGHT, Theme, style
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
 from rl2grid.grids.rankings import Trials, ranking, trials
 from rl2grid.mdp.actions import ActionKind, StepAction, describe
+from rl2grid.records.statistics import Floats
 
 MAX_POINTS = 600
 """Columns of a curve over actions: more actions are pooled."""

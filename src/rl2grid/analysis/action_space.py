@@ -9,7 +9,6 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rl2grid.analysis.statistics import LEVEL, Floats
 from rl2grid.errors import UsageError
 from rl2grid.grids import STEPS_PER_HOUR, Grid
 from rl2grid.grids.rankings import ranking, trials
@@ -23,6 +22,7 @@ from rl2grid.mdp.actions import (
     level_ids,
     moved_elements,
 )
+from rl2grid.records.statistics import LEVEL, Floats
 
 MINUTES_PER_STEP = 60 // STEPS_PER_HOUR
 

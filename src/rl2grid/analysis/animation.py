@@ -13,12 +13,12 @@ from matplotlib.colors import to_rgba_array
 from numpy.typing import NDArray
 from PIL import Image
 
-from rl2grid.analysis.recordings import Recording
 from rl2grid.drawing.episode_frames import describe_moment
 from rl2grid.drawing.grid_drawing import Caption, FrameRenderer, Scene, loading_colours
 from rl2grid.drawing.theme import GREEN, LIGHT, PURPLE
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
+from rl2grid.records.recordings import Recording
 from rl2grid.scenarios.scenario import STEP
 
 Frame = NDArray[np.uint8]

@@ -16,11 +16,11 @@ from matplotlib.ticker import FuncFormatter, PercentFormatter
 from rl2grid.analysis import figures
 from rl2grid.analysis.figures import STEPS_PER_DAY
 from rl2grid.analysis.lifetimes import kaplan_meier, lifetimes
-from rl2grid.analysis.methods import COSTS, Method, resampled_units
 from rl2grid.analysis.result_tables import AGGREGATES
-from rl2grid.analysis.statistics import Estimate, estimate, probability_of_improvement, score_band, share_above
 from rl2grid.drawing.theme import BLUE, LIGHT, VERMILLION, Theme, style
 from rl2grid.mdp.constraints import THRESHOLDS
+from rl2grid.records.methods import COSTS, Method, resampled_units
+from rl2grid.records.statistics import Estimate, estimate, probability_of_improvement, score_band, share_above
 
 THRESHOLDS_DRAWN = 201
 """Points of a performance profile."""

@@ -16,11 +16,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from rl2grid.analysis import figures
-from rl2grid.analysis.episodes import Episode
-from rl2grid.analysis.statistics import Floats
 from rl2grid.drawing.grid_drawing import GridDrawing, reference_scene
 from rl2grid.drawing.theme import LIGHT, Theme, style
 from rl2grid.grids import Grid
+from rl2grid.records.episodes import Episode
+from rl2grid.records.statistics import Floats
 
 MOST = 12
 """Lines or substations drawn as bars."""

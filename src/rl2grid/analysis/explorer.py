@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from importlib import resources
 from typing import Any
 
-from rl2grid.analysis.episodes import Episode
-from rl2grid.analysis.methods import method_label
-from rl2grid.analysis.results import EvaluationResult
 from rl2grid.envs.tasks import short_id
 from rl2grid.mdp.termination import GAME_OVER_TEXT, GameOver
+from rl2grid.records.episodes import Episode
+from rl2grid.records.evaluations import EvaluationResult
+from rl2grid.records.methods import method_label
 
 DIGITS = 6
 """Significant digits of the numbers that are shown."""

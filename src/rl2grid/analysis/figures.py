@@ -24,10 +24,6 @@ from matplotlib.text import Annotation
 from matplotlib.ticker import FuncFormatter, PercentFormatter
 from numpy.typing import NDArray
 
-from rl2grid.analysis.recordings import Recording
-from rl2grid.analysis.results import EvaluationResult
-from rl2grid.analysis.statistics import Floats, bootstrap_band, episode_mean
-from rl2grid.analysis.training import SURVIVAL, Metric, TrainingCurve
 from rl2grid.drawing.theme import (
     FULL_SCALE,
     GREEN,
@@ -39,6 +35,10 @@ from rl2grid.drawing.theme import (
     loading_colours,
     style,
 )
+from rl2grid.records.evaluations import EvaluationResult
+from rl2grid.records.recordings import Recording
+from rl2grid.records.statistics import Floats, bootstrap_band, episode_mean
+from rl2grid.records.trainings import SURVIVAL, Metric, TrainingCurve
 
 STEPS_PER_DAY = 288
 MAX_COLUMNS = 360
@@ -59,7 +59,7 @@ def training_curves(
     visible, several runs as their mean with a 95% bootstrap interval over runs. Diamonds are validation.
 
     Args:
-        curves: at least one; see :func:`rl2grid.analysis.training.read_training_curve`.
+        curves: at least one; see :func:`rl2grid.records.trainings.read_training_curve`.
         x: ``"decisions"`` or ``"grid_steps"``.
         theme: colours.
         title: of the figure.

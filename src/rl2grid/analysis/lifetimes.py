@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from rl2grid.analysis.episodes import Episode
-from rl2grid.analysis.statistics import LEVEL, Floats
+from rl2grid.records.episodes import Episode
+from rl2grid.records.statistics import LEVEL, Floats
 
 
 @dataclass(frozen=True, eq=False)

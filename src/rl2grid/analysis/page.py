@@ -10,9 +10,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from rl2grid.analysis.files import write_text
-from rl2grid.analysis.results import identity_hash
 from rl2grid.analysis.tables import Cell, ResultTable
+from rl2grid.records.evaluations import identity_hash
+from rl2grid.records.files import write_text
 
 
 def write_page(path: Path, title: str, parts: Sequence[str]) -> None:

@@ -17,7 +17,6 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from rl2grid.analysis import figures, tables
-from rl2grid.analysis.files import make_folder, write_text
 from rl2grid.analysis.page import (
     cell_html,
     code_html,
@@ -29,11 +28,12 @@ from rl2grid.analysis.page import (
     table_html,
     write_page,
 )
-from rl2grid.analysis.recordings import Recording
-from rl2grid.analysis.results import EvaluationResult, check_comparable
-from rl2grid.analysis.summary import Summary
-from rl2grid.analysis.training import TrainingCurve
 from rl2grid.drawing.theme import DARK, LIGHT, Theme
+from rl2grid.records.evaluations import EvaluationResult, check_comparable
+from rl2grid.records.files import make_folder, write_text
+from rl2grid.records.recordings import Recording
+from rl2grid.records.summary import Summary
+from rl2grid.records.trainings import TrainingCurve
 
 REPORT_FILE, TABLE_FILE, FIGURES_FOLDER = "report.html", "results.md", "figures"
 

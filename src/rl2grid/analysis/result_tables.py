@@ -8,8 +8,12 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 
 from rl2grid.analysis.lifetimes import kaplan_meier, lifetimes, log_rank
-from rl2grid.analysis.methods import COSTS, Method, resampled_units
-from rl2grid.analysis.statistics import (
+from rl2grid.analysis.tables import MISSING, Cell, Column, ResultTable, interval_cell, mean_cell, share_cell
+from rl2grid.envs.tasks import short_id
+from rl2grid.mdp.constraints import THRESHOLDS
+from rl2grid.mdp.termination import GAME_OVER_TEXT, GameOver
+from rl2grid.records.methods import COSTS, Method, resampled_units
+from rl2grid.records.statistics import (
     Aggregate,
     estimate,
     iqm_score,
@@ -18,10 +22,6 @@ from rl2grid.analysis.statistics import (
     optimality_gap,
     probability_of_improvement,
 )
-from rl2grid.analysis.tables import MISSING, Cell, Column, ResultTable, interval_cell, mean_cell, share_cell
-from rl2grid.envs.tasks import short_id
-from rl2grid.mdp.constraints import THRESHOLDS
-from rl2grid.mdp.termination import GAME_OVER_TEXT, GameOver
 
 HEURISTIC_LETTERS: dict[str, str] = {"none": "V", "idle": "I", "recovery": "R"}
 """The paper's: vanilla, idle and recovery."""

@@ -16,7 +16,6 @@ from PIL import Image
 
 from rl2grid.analysis import figures
 from rl2grid.analysis.explorer import explorer_html
-from rl2grid.analysis.methods import Method, method_label
 from rl2grid.analysis.page import (
     commands_html,
     facts_html,
@@ -26,12 +25,13 @@ from rl2grid.analysis.page import (
     write_page,
 )
 from rl2grid.analysis.result_tables import Methods, ranking, ranking_table
-from rl2grid.analysis.results import EvaluationResult
 from rl2grid.analysis.section import Picture, Section, plan_section
-from rl2grid.analysis.sources import Sources
-from rl2grid.analysis.training import TrainingRun
 from rl2grid.drawing.theme import DARK, LIGHT
 from rl2grid.envs.tasks import short_id
+from rl2grid.records.evaluations import EvaluationResult
+from rl2grid.records.methods import Method, method_label
+from rl2grid.records.sources import Sources
+from rl2grid.records.trainings import TrainingRun
 
 MAX_BYTES = 20_000_000
 """Of a page; figures of a larger one are made smaller."""

@@ -19,16 +19,16 @@ from matplotlib.figure import Figure
 from rl2grid.analysis import comparison_figures as compare
 from rl2grid.analysis import figures
 from rl2grid.analysis.ending_figures import draw_ending_bars, draw_ending_map
-from rl2grid.analysis.files import make_folder, write_text
-from rl2grid.analysis.methods import Method, group_methods
 from rl2grid.analysis.result_tables import Methods, result_tables
-from rl2grid.analysis.results import EvaluationResult
 from rl2grid.analysis.tables import WRITERS, ResultTable
-from rl2grid.analysis.training import TrainingCurve, TrainingRun, group_curves
 from rl2grid.analysis.training_figures import COST_PANELS, SCORE_PANELS, draw_panels, logs
 from rl2grid.drawing.theme import LIGHT, Theme
 from rl2grid.envs.tasks import short_id
 from rl2grid.errors import UsageError
+from rl2grid.records.evaluations import EvaluationResult
+from rl2grid.records.files import make_folder, write_text
+from rl2grid.records.methods import Method, group_methods
+from rl2grid.records.trainings import TrainingCurve, TrainingRun, group_curves
 
 INDEX_FILE, TABLES_FOLDER, FIGURES_FOLDER = "index.md", "tables", "figures"
 

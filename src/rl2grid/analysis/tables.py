@@ -12,8 +12,8 @@ import rich.box
 from rich.table import Table
 from rich.text import Text
 
-from rl2grid.analysis.statistics import Estimate
-from rl2grid.analysis.summary import Summary
+from rl2grid.records.statistics import Estimate
+from rl2grid.records.summary import Summary
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, PercentFormatter
 
 from rl2grid.analysis import figures
-from rl2grid.analysis.training import SURVIVAL, TrainingCurve
 from rl2grid.drawing.theme import LIGHT, VERMILLION, Theme, style
 from rl2grid.mdp.constraints import THRESHOLDS
+from rl2grid.records.trainings import SURVIVAL, TrainingCurve
 
 
 class Panel(NamedTuple):

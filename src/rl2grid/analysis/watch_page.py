@@ -19,10 +19,10 @@ from matplotlib.colors import to_hex
 from numpy.typing import NDArray
 
 from rl2grid.analysis.page import write_page
-from rl2grid.analysis.recordings import Recording
 from rl2grid.drawing.grid_drawing import geometry_of, largest_power, loading_colours
 from rl2grid.drawing.theme import DARK, FULL_SCALE, LIGHT, Theme
 from rl2grid.grids import Grid
+from rl2grid.records.recordings import Recording
 
 MAX_LOADING = 255
 """Percent: higher loadings are shown as this."""

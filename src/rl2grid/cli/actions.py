@@ -16,10 +16,10 @@ from rich.console import Console
 from rich.table import Table
 
 from rl2grid.analysis.action_space import ActionRow, explain_action, list_actions, select_actions
-from rl2grid.analysis.files import make_folder
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid, load_grid
 from rl2grid.mdp.actions import StepAction, full_catalogue
+from rl2grid.records.files import make_folder
 
 SHOWN = 50
 """Actions listed unless --all is given."""

@@ -9,8 +9,8 @@ from typing import Any
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-from rl2grid.analysis.sources import load_sources
 from rl2grid.errors import UsageError
+from rl2grid.records.sources import load_sources
 from rl2grid.scenarios.splits import SPLITS
 
 THEMES = ("light", "dark")

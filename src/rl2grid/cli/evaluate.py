@@ -12,8 +12,8 @@ from rich.console import Console
 from rl2grid.analysis.tables import rich_table
 from rl2grid.cli import keywords
 from rl2grid.envs.tasks import find_task
-from rl2grid.experiments.evaluation import evaluate, evenly_spread
-from rl2grid.experiments.flags import environment_flags, evaluate_command
+from rl2grid.evaluation.flags import environment_flags, evaluate_command
+from rl2grid.evaluation.protocol import evaluate, evenly_spread
 
 
 def run(options: argparse.Namespace) -> int:

@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from rl2grid.analysis.entries import Entry, read_entry, write_entry
-from rl2grid.analysis.methods import Method
-from rl2grid.analysis.results import check_comparable
 from rl2grid.analysis.tables import result_table_rich
 from rl2grid.errors import UsageError
+from rl2grid.records.entries import Entry, read_entry, write_entry
+from rl2grid.records.evaluations import check_comparable
+from rl2grid.records.methods import Method
 from rl2grid.scenarios.splits import SPLITS
 
 if TYPE_CHECKING:
-    from rl2grid.analysis.results import EvaluationResult
+    from rl2grid.records.evaluations import EvaluationResult
 
 DIFFERENT = 1
 """Exit status when an entry is not what its actions make."""
@@ -64,8 +64,8 @@ def _add_table(actions: Any) -> None:
 
 
 def _entry(options: argparse.Namespace) -> int:
-    from rl2grid.analysis.results import load_evaluation
-    from rl2grid.experiments.leaderboard import find_evaluation, make_entry
+    from rl2grid.ledger.leaderboard import find_evaluation, make_entry
+    from rl2grid.records.evaluations import load_evaluation
 
     folder = find_evaluation(options.folder, options.split)
     if not options.output.parent.is_dir():
@@ -82,7 +82,7 @@ def _entry(options: argparse.Namespace) -> int:
 
 
 def _verify(options: argparse.Namespace) -> int:
-    from rl2grid.experiments.leaderboard import check_entry, verify_entry
+    from rl2grid.ledger.leaderboard import check_entry, verify_entry
 
     entries = _read(options.files)
     for path, entry in entries.items():

@@ -85,7 +85,7 @@ def _add_demo(commands: argparse._SubParsersAction[_Parser]) -> None:
 
 
 def _demo(options: argparse.Namespace) -> int:
-    from rl2grid.experiments.demo import run_demo
+    from rl2grid.studies.demo import run_demo
 
     run_demo(options.output, decisions=options.decisions)
     return 0
@@ -139,7 +139,7 @@ def _add_rank(commands: argparse._SubParsersAction[_Parser]) -> None:
 
 
 def _rank(options: argparse.Namespace) -> int:
-    from rl2grid.experiments.ranking import run_ranking
+    from rl2grid.evaluation.ranking import run_ranking
 
     path = run_ranking(
         options.grid,

@@ -10,12 +10,12 @@ from typing import Any
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-from rl2grid.analysis.files import make_folder
-from rl2grid.analysis.sources import Sources, load_sources
-from rl2grid.analysis.training import TrainingRun
 from rl2grid.cli.analyse import SPLIT_HELP
 from rl2grid.envs.tasks import short_id
 from rl2grid.errors import UsageError
+from rl2grid.records.files import make_folder
+from rl2grid.records.sources import Sources, load_sources
+from rl2grid.records.trainings import TrainingRun
 from rl2grid.scenarios.splits import SPLITS
 
 PAGE_FILE = "report.html"
@@ -69,7 +69,7 @@ def _train_commands(runs: Sequence[TrainingRun]) -> dict[Path, str]:
     if not runs:
         return {}
     try:
-        from rl2grid.experiments.commands import training_command
+        from rl2grid.training.commands import training_command
     except ImportError as error:
         raise UsageError(f"Reports of runs need {error.name}: install it with `pip install rl2grid[train]`.") from None
     return {run.folder: training_command(run.folder) for run in runs}

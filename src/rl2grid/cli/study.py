@@ -13,7 +13,7 @@ from rl2grid.cli.train import INTERRUPTED
 from rl2grid.errors import UsageError
 
 if TYPE_CHECKING:
-    from rl2grid.experiments.study import Study
+    from rl2grid.studies.study import Study
 
 FAILED = 1
 """Exit status when cells were given up."""
@@ -70,8 +70,8 @@ def _add_tune(actions: Any) -> None:
 
 def _run(options: argparse.Namespace) -> int:
     study = _load(options)
-    from rl2grid.experiments.study_backends import make_backend
-    from rl2grid.experiments.study_run import State, results_table, run_study, study_table
+    from rl2grid.studies.backends import make_backend
+    from rl2grid.studies.run import State, results_table, run_study, study_table
 
     console = Console()
     backend = make_backend(options.backend, study.output / "jobs", options.jobs, study.slurm)
@@ -92,7 +92,7 @@ def _run(options: argparse.Namespace) -> int:
 
 def _status(options: argparse.Namespace) -> int:
     study = _load(options)
-    from rl2grid.experiments.study_run import read_states, results_table, study_table
+    from rl2grid.studies.run import read_states, results_table, study_table
 
     console, states = Console(), read_states(study)
     console.print(study_table(study, states, None))
@@ -103,8 +103,8 @@ def _status(options: argparse.Namespace) -> int:
 
 def _list(options: argparse.Namespace) -> int:
     _check_installed()
-    from rl2grid.experiments.study import included_studies, parse_study
-    from rl2grid.experiments.study_file import read_toml
+    from rl2grid.studies.study import included_studies, parse_study
+    from rl2grid.studies.toml_file import read_toml
 
     table = Table(box=None, pad_edge=False)
     for column in ("study", "scale", "cells", "decisions"):
@@ -120,7 +120,7 @@ def _list(options: argparse.Namespace) -> int:
 
 def _tune(options: argparse.Namespace) -> int:
     _check_installed()
-    from rl2grid.experiments.tuning import best_command, load_tuning, run_tuning
+    from rl2grid.studies.tuning import best_command, load_tuning, run_tuning
 
     tuning = load_tuning(options.file, options.output)
     best = run_tuning(tuning, options.jobs, Console())
@@ -134,7 +134,7 @@ def _tune(options: argparse.Namespace) -> int:
 
 def _load(options: argparse.Namespace) -> Study:
     _check_installed()
-    from rl2grid.experiments.study import load_study
+    from rl2grid.studies.study import load_study
 
     return load_study(options.file, options.scale, options.output)
 

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 from rl2grid.cli.keywords import NAMES, reward_of
 from rl2grid.envs.tasks import TaskOptions, find_task
 from rl2grid.errors import UsageError, one_of
-from rl2grid.experiments.limits import TimeLimit
+from rl2grid.training.limits import TimeLimit
 
 if TYPE_CHECKING:
-    from rl2grid.experiments.runs import Hyperparameters
+    from rl2grid.training.runs import Hyperparameters
 
 INTERRUPTED = 130
 """Exit status after an interrupt, as shells have it."""
@@ -104,8 +104,8 @@ def train(command_line: list[str]) -> int:
 def _resume(arguments: list[str]) -> int:
     if not arguments or arguments[0].startswith("-"):
         raise UsageError("Resuming needs one run folder, for example `rl2grid train --resume runs/bus14-T0-v0-ppo-1`.")
-    from rl2grid.experiments import runs
-    from rl2grid.experiments.validation import find_validator
+    from rl2grid.training import runs
+    from rl2grid.training.validation import find_validator
 
     path, flags = Path(arguments[0]), arguments[1:]
     _refuse_unknown(flags, [*fields(ResumeFlags)])
@@ -119,8 +119,8 @@ def _resume(arguments: list[str]) -> int:
 def _begin(algorithm: str, task_id: str, flags: list[str]) -> int:
     task = find_task(task_id)
     try:
-        from rl2grid.experiments import runs
-        from rl2grid.experiments.validation import find_validator
+        from rl2grid.training import runs
+        from rl2grid.training.validation import find_validator
     except ImportError as error:
         raise UsageError(f"Training needs {error.name}: install it with `pip install rl2grid[train]`.") from None
     if algorithm not in runs.ALGORITHMS:
@@ -158,8 +158,8 @@ def _begin(algorithm: str, task_id: str, flags: list[str]) -> int:
 
 
 def _report(folder: Path, task_id: str, limit: TimeLimit) -> int:
-    from rl2grid.experiments import runs
-    from rl2grid.experiments.energy import energy_line
+    from rl2grid.training import runs
+    from rl2grid.training.energy import energy_line
 
     used = energy_line(folder)
     if used:

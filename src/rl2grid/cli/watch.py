@@ -11,11 +11,11 @@ from typing import Any
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from rl2grid.analysis.files import make_folder
 from rl2grid.cli.train import INTERRUPTED
 from rl2grid.engines import HEURISTICS
 from rl2grid.envs.tasks import find_task
 from rl2grid.errors import UsageError
+from rl2grid.records.files import make_folder
 from rl2grid.scenarios.splits import SPLITS
 
 FRAMES = 300
@@ -76,8 +76,8 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _play(options: argparse.Namespace, progress: Progress) -> Any:
-    from rl2grid.experiments.evaluation import AS_TRAINED
-    from rl2grid.experiments.watching import play_to_watch
+    from rl2grid.evaluation.protocol import AS_TRAINED
+    from rl2grid.evaluation.watching import play_to_watch
 
     task = progress.add_task("Playing", total=None)
     heuristic = {None: AS_TRAINED, "None": None}.get(options.heuristic, options.heuristic)

@@ -2,7 +2,7 @@
 
 A ranking file ``data/<grid>.ranking.npz`` holds the catalogue ids in order, best first, what came of every
 action's trials and, as JSON, how it was made. It is written by ``rl2grid rank <grid>``; see
-:mod:`rl2grid.experiments.ranking`.
+:mod:`rl2grid.evaluation.ranking`.
 
 The order is read with :func:`ranking`, by every task; the trials with :func:`trials`, by people.
 """

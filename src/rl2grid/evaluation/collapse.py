@@ -1,0 +1,62 @@
+"""Where a grid was hurt when it collapsed: what the rows of lost episodes name."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from rl2grid.mdp.state import GridState
+
+LIMIT = np.float32(1.0)
+
+
+class Collapse(NamedTuple):
+    """Ids in words, in order and separated by spaces; see :class:`rl2grid.records.episodes.Episode`."""
+
+    last_overloads: str = ""
+    last_outages: str = ""
+    last_cut_off: str = ""
+
+
+COMPLETED = Collapse()
+"""Nothing collapsed."""
+
+
+def overloaded_lines(state: GridState, i: int) -> str:
+    """Ids of the lines of row ``i`` above their limit."""
+    return _ids(state.rho[i] > LIMIT)
+
+
+def collapse(state: GridState, i: int, overloads: str) -> Collapse:
+    """What the game over of row ``i`` left; ``overloads``: :func:`overloaded_lines` of the state before it."""
+    topology = state.final_topo_vect[i]
+    out = (topology[state.line_or_pos_topo_vect] < 0) | (topology[state.line_ex_pos_topo_vect] < 0)
+    return Collapse(overloads, _ids(out), _ids(_cut_off(state, i)))
+
+
+def _cut_off(state: GridState, i: int) -> NDArray[np.bool_]:
+    """[sub] whether a load or generator there is off, or something there is not connected to the balancing generator.
+
+    A storage unit or the end of a line may be off.
+    """
+    topology, sub = state.final_topo_vect[i], state.element_to_subid
+    n_sub = len(state.sub_info)
+    busbar = np.where(topology > 0, sub + (topology - 1) * n_sub, -1)
+    ends = np.stack((busbar[state.line_or_pos_topo_vect], busbar[state.line_ex_pos_topo_vect]))
+    ends = ends[:, (ends >= 0).all(axis=0)]
+    links = coo_array((np.ones(ends.shape[1]), ends), shape=(2 * n_sub, 2 * n_sub))
+    _, piece = connected_components(links, directed=False)
+    balancing = busbar[state.gen_pos_topo_vect[state.slack_gen[0]]]
+    apart = np.ones(len(topology), np.bool_) if balancing < 0 else piece[busbar] != piece[balancing]
+    vital = np.zeros(len(topology), np.bool_)
+    vital[state.load_pos_topo_vect] = vital[state.gen_pos_topo_vect] = True
+    lost = np.where(busbar < 0, vital, apart)
+    return np.bincount(sub, lost, n_sub) > 0
+
+
+def _ids(flags: NDArray[np.bool_]) -> str:
+    return " ".join(map(str, np.flatnonzero(flags).tolist()))

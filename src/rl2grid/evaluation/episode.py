@@ -1,0 +1,147 @@
+"""One episode of one agent, from reset to ending."""
+
+from __future__ import annotations
+
+import time
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium
+
+from rl2grid.agents.agent import Action, Agent, Info, RandomizedAgent, no_intervention
+from rl2grid.evaluation.collapse import COMPLETED, collapse, overloaded_lines
+from rl2grid.mdp.termination import GameOver
+
+OnDecision = Callable[[Action, Info], None]
+"""Called with every action of the agent and the ``info`` on which it was chosen."""
+
+
+@dataclass(frozen=True)
+class PlayedEpisode:
+    """What happened in an episode; see :class:`rl2grid.records.episodes.Episode` for the meaning and units."""
+
+    scenario: str
+    seed: int
+    start: int
+    episode_length: int
+    grid_steps: int
+    decisions: int
+    survival: float
+    completed: bool
+    game_over: str
+    last_overloads: str
+    last_outages: str
+    last_cut_off: str
+    episode_return: float
+    return_survive: float
+    return_overload: float
+    return_cost: float
+    cost_lsi: float
+    cost_tlo: float
+    score_margin: float
+    score_overload: float
+    score_topology: float
+    illegal: int
+    ambiguous: int
+    wall_time_s: float
+
+
+def play_episode(
+    agent: Agent,
+    env: gymnasium.Env[Any, Any],
+    *,
+    scenario: str,
+    seed: int,
+    start: int = 0,
+    on_decision: OnDecision | None = None,
+) -> PlayedEpisode:
+    """Play one episode with an agent that is bound to ``env``.
+
+    Everything that a transition accrued counts, heuristic steps and those before the first decision
+    included. An episode that ends before its first decision is an episode like any other, in which the
+    agent is never asked.
+
+    Args:
+        agent: bound to ``env``.
+        env: made by ``gymnasium.make``.
+        scenario: id of the scenario.
+        seed: of maintenance, opponent and agent, together with the scenario; see :func:`environment_seed`.
+        start: row at which the episode begins.
+        on_decision: called at every decision.
+
+    Raises:
+        UsageError: the scenario is not in the split of ``env``, or leaves nothing to play after ``start``.
+    """
+    began = time.perf_counter()
+    if isinstance(agent, RandomizedAgent):
+        agent.seed_episode(seed, _episode_number(scenario, start))
+    options = {"scenario": scenario, "start": start}
+    observation, info = env.reset(seed=environment_seed(scenario, seed), options=options)
+    agent.reset(0)
+    totals: dict[str, float] = dict.fromkeys(_TOTALS, 0.0)
+    decisions = illegal = ambiguous = 0
+    over = False
+    state = env.unwrapped.state  # type: ignore[attr-defined]
+    while not over:
+        # The agent is only asked where the heuristic is not at ease, so that a game over in a later step of the
+        # transition, or inside the reset, comes from a state without overloads.
+        decided, overloads = info["step"], overloaded_lines(state, 0)
+        if info["over"]:
+            action = no_intervention(env.action_space)
+        else:
+            action = agent.act(observation, info)
+            decisions += 1
+            if on_decision is not None:
+                on_decision(action, info)
+        observation, reward, terminated, truncated, info = env.step(action)
+        over = terminated or truncated
+        _add(totals, float(reward), info)
+        illegal += int(info["illegal"])
+        ambiguous += int(info["ambiguous"])
+    ending = collapse(state, 0, overloads if info["step"] == decided + 1 else "") if terminated else COMPLETED
+    return PlayedEpisode(
+        scenario=scenario,
+        seed=seed,
+        start=start,
+        episode_length=int(info["episode_length"]),
+        grid_steps=int(info["step"]),
+        decisions=decisions,
+        survival=float(info["survival"]),
+        completed=not terminated,
+        game_over=GameOver(info["game_over"]).name,
+        score_margin=float(info["scores"]["margin"]),
+        score_overload=float(info["scores"]["overload"]),
+        score_topology=float(info["scores"]["topology"]),
+        illegal=illegal,
+        ambiguous=ambiguous,
+        wall_time_s=round(time.perf_counter() - began, 4),
+        last_overloads=ending.last_overloads,
+        last_outages=ending.last_outages,
+        last_cut_off=ending.last_cut_off,
+        **totals,
+    )
+
+
+def environment_seed(scenario: str, seed: int) -> int:
+    """The seed that the environment is reset with: months that are played with one seed share no attack or outage."""
+    return (zlib.crc32(scenario.encode()) << 31) + seed
+
+
+_TOTALS = ("episode_return", "return_survive", "return_overload", "return_cost", "cost_lsi", "cost_tlo")
+
+
+def _add(totals: dict[str, float], reward: float, info: Info) -> None:
+    components, costs = info["reward_components"], info["costs"]
+    totals["episode_return"] += reward
+    totals["return_survive"] += components["survive"]
+    totals["return_overload"] += components["overload"]
+    totals["return_cost"] += components["cost"]
+    totals["cost_lsi"] += costs["LSI"]
+    totals["cost_tlo"] += costs["TLO"]
+
+
+def _episode_number(scenario: str, start: int) -> int:
+    """A number for the agent's random stream: scenarios of one seed are to be played differently."""
+    return zlib.crc32(f"{scenario}@{start}".encode())

@@ -1,0 +1,113 @@
+"""Plays one episode and keeps what every grid step showed, heuristic steps included."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from rl2grid.agents.agent import Action, Agent, Info
+from rl2grid.evaluation.episode import play_episode
+from rl2grid.mdp.state import GridState
+from rl2grid.mdp.termination import GAME_OVER_TEXT, GameOver
+from rl2grid.records.recordings import Recording
+
+_OBSERVED = ("rho", "line_status", "attacked", "gen_p", "load_p", "storage_power")
+
+OnStep = Callable[[int, int], None]
+"""Called after every grid step with the steps played and the length of the episode."""
+
+
+class _Stop(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Ends the episode at the first decision after a number of grid steps."""
+
+    def __init__(self, env: gymnasium.Env[Any, Any], steps: int) -> None:
+        super().__init__(env)
+        self._steps = steps
+
+    def step(self, action: Action) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return observation, reward, terminated, truncated or info["step"] >= self._steps, info
+
+
+class _Recorder:
+    """Listens to the grid steps and the decisions of one environment."""
+
+    def __init__(self, env: Any, on_step: OnStep | None) -> None:
+        self._env, self._on_step = env, on_step
+        self.columns: dict[str, list[NDArray[Any]]] = {name: [] for name in (*_OBSERVED, "topo_vect", "maintained")}
+        self.decision_steps: list[int] = []
+        self.actions: list[str] = []
+
+    def hear(self, state: GridState, row: int) -> None:
+        """Keep a grid step; that of a game over has no flows to show, and is kept only if nothing else was played."""
+        if state.terminated[row] and self.columns["rho"]:
+            return
+        for name in _OBSERVED:
+            self.columns[name].append(getattr(state, name)[row].copy())
+        self.columns["topo_vect"].append(state.topo_vect[row].astype(np.int8))
+        self.columns["maintained"].append(state.time_next_maintenance[row] == 0)
+        if self._on_step is not None:
+            self._on_step(int(state.step[row]), int(state.episode_length[row]))
+
+    def note(self, action: Action, info: Info) -> None:
+        """Keep a decision, in words unless it does nothing."""
+        self.decision_steps.append(int(info["step"]))
+        self.actions.append(self._env.describe_action(action) if np.any(action) else "")
+
+
+def record_episode(
+    agent: Agent,
+    env: gymnasium.Env[Any, Any],
+    *,
+    scenario: str,
+    seed: int = 0,
+    start: int = 0,
+    steps: int | None = None,
+    on_step: OnStep | None = None,
+) -> Recording:
+    """Play one episode with an agent that is bound to ``env``.
+
+    Args:
+        agent: bound to ``env``.
+        env: made by ``gymnasium.make``.
+        scenario: id of the scenario.
+        seed: of maintenance, opponent and agent.
+        start: row at which the episode begins.
+        steps: record no more grid steps than these; None: all of the episode.
+        on_step: called after every grid step.
+
+    Raises:
+        UsageError: the scenario is not in the split of ``env``, or leaves nothing to play after ``start``.
+    """
+    base: Any = env.unwrapped
+    recorder = _Recorder(base, on_step)
+    played = env if steps is None else _Stop(env, steps)
+    base.step_listeners.append(recorder.hear)
+    try:
+        episode = play_episode(agent, played, scenario=scenario, seed=seed, start=start, on_decision=recorder.note)
+    finally:
+        base.step_listeners.remove(recorder.hear)
+    reason = GameOver[episode.game_over]
+    # What the heuristic played beyond the last step asked for is cut off, and with it the ending.
+    stop = len(recorder.columns["rho"]) if steps is None else steps + 1
+    cut = stop < len(recorder.columns["rho"])
+    n_decisions = sum(step < stop for step in recorder.decision_steps)
+    return Recording(
+        task=base.task.id,
+        agent=agent.name,
+        heuristic=base.options.heuristic or "none",
+        scenario=scenario,
+        seed=seed,
+        start=start,
+        episode_length=episode.episode_length,
+        began=base.clock_at(0).isoformat(),
+        game_over="" if cut or reason == GameOver.NONE else GAME_OVER_TEXT[reason],
+        line_names=base.grid.name_line,
+        decision_steps=tuple(recorder.decision_steps[:n_decisions]),
+        actions=tuple(recorder.actions[:n_decisions]),
+        **{name: np.array(rows[:stop]) for name, rows in recorder.columns.items()},
+    )

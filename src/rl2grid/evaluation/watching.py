@@ -1,0 +1,59 @@
+"""Plays one episode to be watched: any agent, recorded step by step."""
+
+from __future__ import annotations
+
+import gymnasium
+
+from rl2grid.envs.registration import register_all
+from rl2grid.envs.tasks import find_task
+from rl2grid.errors import UsageError
+from rl2grid.evaluation.agents import make_agent
+from rl2grid.evaluation.protocol import AS_TRAINED, env_keywords
+from rl2grid.evaluation.recording import OnStep, record_episode
+from rl2grid.records.recordings import Recording
+from rl2grid.scenarios.library import check_in_split, list_scenarios
+
+
+def play_to_watch(
+    agent: str,
+    task_id: str,
+    *,
+    split: str = "validation",
+    scenario: str | None = None,
+    seed: int = 0,
+    heuristic: str | None = AS_TRAINED,
+    steps: int | None = None,
+    on_step: OnStep | None = None,
+) -> Recording:
+    """Play and record one episode; it is the one that an evaluation with the same seed plays.
+
+    Args:
+        agent: a name, run folder or checkpoint; see :func:`rl2grid.evaluation.agents.make_agent`.
+        task_id: id of the task; the namespace and the version may be left out.
+        split: whose scenario is played.
+        scenario: None: the first of the split.
+        seed: of maintenance, opponent and agent.
+        heuristic: None, ``"idle"``, ``"recovery"``, or the one that the policy was trained with.
+        steps: record no more grid steps than these.
+        on_step: called after every grid step.
+
+    Raises:
+        UsageError: the request cannot be met; nothing was played.
+    """
+    task = find_task(task_id)
+    if steps is not None and steps < 1:
+        raise UsageError(f"steps={steps} is not allowed: give a number of grid steps, at least 1.")
+    if seed < 0:
+        raise UsageError(f"seed={seed} is not allowed: give an integer that is not negative.")
+    chosen = make_agent(agent, task.id)
+    keywords = env_keywords(chosen, {"split": split, "heuristic": heuristic})
+    if scenario is None:
+        scenario = list_scenarios(task.grid_id, split)[0]
+    check_in_split(task.grid_id, split, scenario)
+    register_all()
+    env = gymnasium.make(task.id, disable_env_checker=True, **keywords)
+    try:
+        chosen.bind(env)
+        return record_episode(chosen, env, scenario=scenario, seed=seed, steps=steps, on_step=on_step)
+    finally:
+        env.close()

@@ -1,1 +1,0 @@
-"""Training runs, evaluations and rankings."""

@@ -1,0 +1,1 @@
+"""Results that anyone can check: entries whose actions are played again."""

@@ -1,0 +1,1 @@
+"""What is stored: episodes, evaluations, trainings, entries, recordings; and their statistics."""

@@ -1,0 +1,199 @@
+"""Entries of a leaderboard: the episodes of an evaluation with every action, so that anyone can play them again.
+
+An entry is one JSON file; ``docs/leaderboard.md`` describes it. Actions are the agent's, one for each decision, as
+little-endian numbers, compressed (zlib) and written in base64: ids in as few bytes as the task's number of actions
+needs, continuous actions as float32.
+"""
+
+from __future__ import annotations
+
+import base64
+import functools
+import hashlib
+import json
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rl2grid.errors import UsageError
+from rl2grid.records.episodes import COLUMNS, Episode
+from rl2grid.records.evaluations import EvaluationResult, identity_hash
+from rl2grid.records.files import write_json
+
+FORMAT, VERSION = "rl2grid leaderboard entry", 1
+MAX_BYTES = 500_000_000
+"""Of the unpacked actions of one episode: a file that claims more is no entry."""
+
+Actions = NDArray[Any]
+"""Unsigned integers [decision] on topology tasks, float32 [decision, continuous] on redispatching tasks."""
+
+_OF_THE_EVALUATION = frozenset(
+    {"task", "agent", "heuristic", "split", "engine", "scenario_pack_hash", "action_set_hash", "agent_hash", "identity"}
+)
+FACTS: tuple[str, ...] = tuple(name for name in COLUMNS if name not in {*_OF_THE_EVALUATION, "wall_time_s"})
+"""Columns of :class:`~rl2grid.records.episodes.Episode` that the environment and the actions alone decide."""
+_TYPES = {name: Episode.__annotations__[name] for name in FACTS}
+_ALLOWED = {"str": (str,), "int": (int,), "float": (int, float), "bool": (bool,)}
+
+
+@dataclass(frozen=True, eq=False)
+class PlayedActions:
+    """What happened in an episode, and the actions that made it happen."""
+
+    facts: Mapping[str, Any]
+    """By name in :data:`FACTS`."""
+    actions: Actions
+
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+        return f"{self.facts['scenario']}, seed {self.facts['seed']}"
+
+
+@dataclass(frozen=True, eq=False)
+class Entry:
+    """An evaluation that can be played again without its agent."""
+
+    label: str
+    """What tables call the agent."""
+    identity: Mapping[str, Any]
+    """Of the evaluation; see :class:`~rl2grid.records.evaluations.EvaluationResult`."""
+    command: str
+    """What made the evaluation."""
+    training: Mapping[str, Any] | None
+    """Facts of the training run; None for agents without one."""
+    episodes: tuple[PlayedActions, ...]
+
+    @functools.cached_property
+    def result(self) -> EvaluationResult:
+        """The evaluation, as tables take it; the time that episodes took is unknown, 0."""
+        identity, agent = self.identity, self.identity["agent_identity"]
+        words = {
+            "task": identity["task"],
+            "agent": self.label,
+            "heuristic": identity["heuristic"] or "none",
+            "split": identity["split"],
+            "engine": identity["engine"],
+            "scenario_pack_hash": identity["scenario_pack_hash"],
+            "action_set_hash": identity["action_set_hash"] or "",
+            "agent_hash": identity_hash(agent) if agent else "",
+            "identity": identity_hash(identity),
+        }
+        episodes = tuple(Episode(**words, **one.facts, wall_time_s=0.0) for one in self.episodes)
+        return EvaluationResult(episodes, identity, self.command)
+
+
+def facts_of(episode: Any) -> dict[str, Any]:
+    """The facts of an episode, played or read."""
+    return {name: getattr(episode, name) for name in FACTS}
+
+
+def episode_hash(facts: Mapping[str, Any]) -> str:
+    """Short hash of what happened in an episode, to the last bit of every number.
+
+    The sums and means over its grid steps are among the facts, so that any difference on the way shows.
+    """
+    values = [float(facts[name]) if _TYPES[name] == "float" else facts[name] for name in FACTS]
+    return hashlib.sha256(json.dumps(values).encode()).hexdigest()[:16]
+
+
+def write_entry(path: Path, entry: Entry) -> None:
+    """Write an entry, whole or not at all."""
+    contents = {
+        "format": FORMAT,
+        "version": VERSION,
+        "label": entry.label,
+        "identity": dict(entry.identity),
+        "identity_hash": identity_hash(entry.identity),
+        "command": entry.command,
+        "training": entry.training,
+        "episodes": [{**one.facts, "hash": episode_hash(one.facts), **_packed(one.actions)} for one in entry.episodes],
+    }
+    write_json(path, contents, indent=1)
+
+
+def read_entry(path: Path) -> Entry:
+    """Read an entry and check that it agrees with itself.
+
+    Raises:
+        UsageError: the file is no entry, one of another version, or was changed.
+    """
+    try:
+        contents = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise UsageError(f"{path} cannot be read as an entry of a leaderboard: {error}.") from None
+    if not isinstance(contents, dict) or contents.get("format") != FORMAT:
+        raise UsageError(f"{path} is no entry of a leaderboard: give files that 'rl2grid leaderboard entry' wrote.")
+    if contents.get("version") != VERSION:
+        raise UsageError(
+            f"{path} is an entry of version {contents.get('version')!r}: this rl2grid reads version {VERSION}."
+        )
+    try:
+        return _parse(path, contents)
+    except (KeyError, TypeError, ValueError, zlib.error) as error:
+        if isinstance(error, UsageError):
+            raise
+        raise UsageError(f"{path} is a damaged entry of a leaderboard: {error!r}.") from None
+
+
+def action_dtype(n_actions: int) -> np.dtype[Any]:
+    """The smallest unsigned integers that hold the ids of ``n_actions`` topology actions."""
+    return np.min_scalar_type(n_actions - 1).newbyteorder("<")
+
+
+def _parse(path: Path, contents: Mapping[str, Any]) -> Entry:
+    identity = dict(contents["identity"])
+    if identity_hash(identity) != contents["identity_hash"]:
+        raise UsageError(f"{path} was changed: its identity does not have the hash {contents['identity_hash']!r}.")
+    if not isinstance(identity["versions"], dict):
+        raise ValueError(f"versions are {identity['versions']!r}")
+    episodes = tuple(_episode(path, stored) for stored in contents["episodes"])
+    if not episodes:
+        raise UsageError(f"{path} is an entry without episodes.")
+    keys = {(one.facts["scenario"], one.facts["seed"], one.facts["start"]) for one in episodes}
+    if len(keys) != len(episodes):
+        raise UsageError(f"{path} was changed: it has an episode twice.")
+    entry = Entry(str(contents["label"]), identity, str(contents["command"]), contents["training"], episodes)
+    _ = entry.result.summary  # refuses what is no table of scenarios and seeds
+    return entry
+
+
+def _episode(path: Path, stored: Mapping[str, Any]) -> PlayedActions:
+    facts = {name: stored[name] for name in FACTS}
+    for name, value in facts.items():
+        allowed = _ALLOWED[_TYPES[name]]
+        if not isinstance(value, allowed) or (isinstance(value, bool) and bool not in allowed):
+            raise UsageError(f"{path} is a damaged entry of a leaderboard: {name} is {value!r}.")
+    episode = PlayedActions(facts, _unpacked(stored))
+    if episode_hash(facts) != stored["hash"]:
+        raise UsageError(f"{path} was changed: the episode {episode.name} does not have the hash {stored['hash']!r}.")
+    if len(episode.actions) != facts["decisions"]:
+        raise UsageError(
+            f"{path} was changed: the episode {episode.name} has {facts['decisions']} decisions and "
+            f"{len(episode.actions)} actions."
+        )
+    return episode
+
+
+def _packed(actions: Actions) -> dict[str, Any]:
+    packed = base64.b64encode(zlib.compress(np.ascontiguousarray(actions).tobytes(), 9)).decode()
+    return {"dtype": actions.dtype.str, "shape": list(actions.shape), "actions": packed}
+
+
+def _unpacked(stored: Mapping[str, Any]) -> Actions:
+    dtype, shape = np.dtype(str(stored["dtype"])), tuple(int(size) for size in stored["shape"])
+    if dtype.kind not in "uf" or len(shape) not in (1, 2) or min(shape) < 0:
+        raise ValueError(f"actions of {dtype} with shape {shape}")
+    n_bytes = dtype.itemsize * int(np.prod(shape, dtype=np.float64))
+    if n_bytes > MAX_BYTES:
+        raise ValueError(f"actions of {n_bytes} bytes")
+    unpacking = zlib.decompressobj()
+    unpacked = unpacking.decompress(base64.b64decode(stored["actions"], validate=True), n_bytes + 1)
+    if len(unpacked) != n_bytes or not unpacking.eof:
+        raise ValueError(f"not {n_bytes} bytes of actions")
+    return np.frombuffer(unpacked, dtype).reshape(shape)

@@ -1,0 +1,118 @@
+"""An evaluation as it is stored: episodes, what they are results of, and the command that made them."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from rl2grid.errors import UsageError
+from rl2grid.records.episodes import EPISODES_FILE, Episode, read_episodes
+from rl2grid.records.files import write_json
+from rl2grid.records.summary import Summary, summarise
+
+EVALUATION_FILE = "evaluation.json"
+
+
+@dataclass(frozen=True)
+class EvaluationResult:
+    """All episodes of one agent on one task."""
+
+    episodes: tuple[Episode, ...]
+    """In the order of scenarios, then seeds."""
+    identity: Mapping[str, Any]
+    """Everything that defines the result: task, engine, data, actions, agent, versions."""
+    command: str
+    """What to type to obtain it again."""
+    folder: Path | None = None
+    """Where it is stored; None: nowhere."""
+
+    @functools.cached_property
+    def summary(self) -> Summary:
+        """Aggregates of the episodes."""
+        return summarise(self.episodes)
+
+
+def identity_hash(identity: Mapping[str, Any]) -> str:
+    """Short hash of an identity, whatever the order of its entries."""
+    return hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def write_evaluation(path: Path, request: Mapping[str, Any], summary: Summary | None) -> None:
+    """Write the description of an evaluation, with its aggregates once it is complete."""
+    record = {**request, "complete": summary is not None, "summary": asdict(summary) if summary else None}
+    write_json(path, record)
+
+
+def read_request(path: Path) -> dict[str, Any]:
+    """What :func:`write_evaluation` was given as ``request``.
+
+    Raises:
+        UsageError: the file is no description of an evaluation.
+    """
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+        del record["complete"], record["summary"]
+        return dict(record)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UsageError(f"{path} is no description of an evaluation: {error!r}.") from None
+
+
+def load_evaluation(folder: Path) -> EvaluationResult:
+    """A finished evaluation.
+
+    Raises:
+        UsageError: the folder holds none, or one that was interrupted.
+    """
+    if not (folder / EVALUATION_FILE).is_file():
+        raise UsageError(f"{folder} holds no evaluation: give a folder that 'rl2grid evaluate' wrote.")
+    request = read_request(folder / EVALUATION_FILE)
+    if not (folder / EPISODES_FILE).is_file():
+        raise UsageError(f"The evaluation in {folder} is unfinished: continue it with {_continuing(request, folder)}.")
+    return EvaluationResult(read_episodes(folder / EPISODES_FILE), request["identity"], request["command"], folder)
+
+
+def _continuing(request: Mapping[str, Any], folder: Path) -> str:
+    """The stored command says what is played, not where it is stored."""
+    command: str = request["command"]
+    if command.startswith("rl2grid "):
+        return f"{command} {shlex.join(('--output', str(folder)))}"
+    return f"{command}, with output={str(folder)!r}"
+
+
+def check_comparable(results: Sequence[EvaluationResult]) -> None:
+    """Refuse results that do not belong into one table.
+
+    Agents and heuristics may differ, the question asked of them may not.
+
+    Raises:
+        UsageError: no results, or results of different tasks, scenarios, engines or versions.
+    """
+    if not results:
+        raise UsageError("There are no results: give at least one evaluation.")
+    first, *others = results
+    for other in others:
+        for key in sorted({*first.identity, *other.identity} - _MAY_DIFFER):
+            mine, theirs = first.identity.get(key), other.identity.get(key)
+            if mine != theirs:
+                raise UsageError(
+                    f"Results of different {key} do not belong into one table: "
+                    f"{first.summary.agent} has {mine!r}, {other.summary.agent} has {theirs!r}."
+                )
+        if _played(first) != _played(other):
+            raise UsageError(
+                f"Results of different scenarios or seeds do not belong into one table: {first.summary.agent} played "
+                f"{len(first.episodes)} episodes, {other.summary.agent} {len(other.episodes)} others."
+            )
+
+
+_MAY_DIFFER = frozenset({"agent", "agent_identity", "heuristic", "normalize"})
+
+
+def _played(result: EvaluationResult) -> set[tuple[str, int, int]]:
+    return {(episode.scenario, episode.seed, episode.start) for episode in result.episodes}

@@ -1,0 +1,158 @@
+"""Evaluations put together: one method is one agent with one heuristic on one task, trained once or several times."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rl2grid.envs.tasks import Task, find_task
+from rl2grid.errors import UsageError
+from rl2grid.mdp.constraints import THRESHOLDS
+from rl2grid.records.episodes import Episode
+from rl2grid.records.evaluations import EvaluationResult, check_comparable
+from rl2grid.records.statistics import Scores, Unit
+from rl2grid.records.summary import by_scenario, safe_episodes
+
+COSTS: dict[str, str] = {"LSI": "cost_lsi", "TLO": "cost_tlo"}
+"""Column of each cost in the rows of episodes."""
+_OF_THE_TASK = frozenset({"task", "grid_hash", "scenario_pack_hash", "action_set_hash", "constraint"})
+_OF_THE_AGENT = frozenset({"agent", "agent_identity", "heuristic", "normalize"})
+
+
+@dataclass(frozen=True, eq=False)
+class Method:
+    """Results of one agent with one heuristic on one task; with several of them, each is of another training run."""
+
+    results: tuple[EvaluationResult, ...]
+
+    @property
+    def first(self) -> Episode:
+        """Any episode: task, agent and heuristic are those of all."""
+        return self.results[0].episodes[0]
+
+    @property
+    def task(self) -> Task:
+        return find_task(self.first.task)
+
+    @property
+    def agent(self) -> str:
+        return self.first.agent
+
+    @property
+    def heuristic(self) -> str:
+        """``none``, ``idle`` or ``recovery``."""
+        return self.first.heuristic
+
+    @property
+    def label(self) -> str:
+        """What tables and figures call it."""
+        return method_label(self.first)
+
+    @property
+    def is_trained(self) -> bool:
+        return bool(self.first.agent_hash)
+
+    @property
+    def episodes(self) -> tuple[Episode, ...]:
+        """Of all runs."""
+        return tuple(episode for result in self.results for episode in result.episodes)
+
+    @property
+    def scenarios(self) -> tuple[str, ...]:
+        """Ids in the order in which scores have them."""
+        return tuple(sorted({episode.scenario for episode in self.results[0].episodes}))
+
+    def scores(self, column: str) -> Scores:
+        """A column of :class:`~rl2grid.records.episodes.Episode`."""
+        return Scores(np.stack([by_scenario(result.episodes, column) for result in self.results]))
+
+    def within(self, constraint: str) -> Scores:
+        """1 for episodes whose cost reached its threshold at most, else 0."""
+        return Scores((self.scores(COSTS[constraint]).values <= THRESHOLDS[constraint]).astype(np.float64))
+
+    def safe(self, constraint: str) -> Scores:
+        """1 for episodes that were completed as well: dying early is not safety."""
+        limits = {constraint: THRESHOLDS[constraint]}
+        return Scores(np.stack([safe_episodes(result.episodes, limits) for result in self.results]))
+
+
+def method_label(episode: Episode) -> str:
+    """What tables and figures call the method of an episode."""
+    return episode.agent if episode.heuristic == "none" else f"{episode.agent} + {episode.heuristic}"
+
+
+def group_methods(results: Sequence[EvaluationResult]) -> dict[str, tuple[Method, ...]]:
+    """Methods by task, both in order of appearance.
+
+    Raises:
+        UsageError: no results, results that do not belong into one table, or one that was given twice.
+    """
+    if not results:
+        raise UsageError("There are no results: give at least one evaluation.")
+    by_task: dict[str, list[EvaluationResult]] = {}
+    for result in results:
+        by_task.setdefault(str(result.identity["task"]), []).append(result)
+    for group in by_task.values():
+        check_comparable(group)
+    _check_same_question([group[0] for group in by_task.values()])
+    return {task: _methods(group) for task, group in by_task.items()}
+
+
+def resampled_units(methods: Iterable[Method]) -> str:
+    """What intervals of these methods are about, in words: the coarsest of what was repeated."""
+    units = {method.scores("survival").unit for method in methods}
+    return ", else ".join(unit.value for unit in Unit if unit in units)
+
+
+def _methods(results: Sequence[EvaluationResult]) -> tuple[Method, ...]:
+    groups: dict[tuple[str, str], list[EvaluationResult]] = {}
+    for result in results:
+        group = groups.setdefault((result.episodes[0].agent, result.episodes[0].heuristic), [])
+        if any(result.episodes[0].agent_hash == other.episodes[0].agent_hash for other in group):
+            raise UsageError(
+                f"The same evaluation of {result.episodes[0].agent} on {result.episodes[0].task} was given twice: "
+                "leave one out."
+            )
+        _check_other_training(result, group)
+        group.append(result)
+    return tuple(Method(tuple(group)) for group in groups.values())
+
+
+def _check_other_training(result: EvaluationResult, group: Sequence[EvaluationResult]) -> None:
+    """Evaluations of one method are repeated trainings: of other seeds, by the same algorithm."""
+    mine = _training(result)
+    if mine is None:
+        return
+    who, task = result.episodes[0].agent, result.episodes[0].task
+    for theirs in filter(None, map(_training, group)):
+        if mine[0] != theirs[0]:
+            raise UsageError(
+                f"Evaluations called {who} on {task} are of policies by {theirs[0]} and by {mine[0]}: tell them "
+                "apart as LABEL=FOLDER."
+            )
+        if mine[1] == theirs[1]:
+            raise UsageError(
+                f"Two evaluations of {who} on {task} are of different policies trained with seed {mine[1]}: leave one "
+                "out, or tell them apart as LABEL=FOLDER."
+            )
+
+
+def _training(result: EvaluationResult) -> tuple[str | None, int] | None:
+    """Algorithm and seed with which the agent was trained; None where its identity does not say."""
+    identity = result.identity.get("agent_identity") or {}
+    seed = identity.get("trained_with", {}).get("seed")
+    return None if seed is None else (identity.get("algorithm"), int(seed))
+
+
+def _check_same_question(results: Sequence[EvaluationResult]) -> None:
+    """Tasks may differ, what is asked on each of them may not."""
+    first = results[0].identity
+    for other in (result.identity for result in results[1:]):
+        for key in sorted({*first, *other} - _OF_THE_TASK - _OF_THE_AGENT):
+            if first.get(key) != other.get(key):
+                raise UsageError(
+                    f"Results of different {key} do not belong into one table: {first['task']} has {first.get(key)!r}, "
+                    f"{other['task']} has {other.get(key)!r}."
+                )

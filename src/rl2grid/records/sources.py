@@ -1,0 +1,162 @@
+"""What tables and figures are made from: the evaluations and training runs that some folders hold.
+
+A folder is one of
+
+- an evaluation, as ``rl2grid evaluate`` writes it;
+- a run, as ``rl2grid train`` writes it; the evaluations below it are taken too;
+- a folder with evaluations in ``evaluation/``, such as that of an agent without training;
+- a study, as ``rl2grid study run`` writes it: the run and the evaluation of every finished cell; or one of its cells.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from rl2grid.errors import UsageError
+from rl2grid.records.evaluations import EVALUATION_FILE, EvaluationResult, load_evaluation
+from rl2grid.records.trainings import RUN_FILE, TrainingRun, read_training_run
+from rl2grid.scenarios.splits import VALIDATION
+
+STUDY_FILE, CELLS_FOLDER = "study.json", "cells"
+CELL_FILE, RESULT_FILE = "cell.json", "result.json"
+RUN_FOLDER, EVALUATION_FOLDER = "run", "evaluation"
+
+
+@dataclass
+class Sources:
+    """Evaluations and runs in the order given."""
+
+    results: list[EvaluationResult] = field(default_factory=list)
+    runs: list[TrainingRun] = field(default_factory=list)
+    missing: list[str] = field(default_factory=list)
+    """One sentence for each thing that was to be expected and is not there."""
+
+
+def load_sources(folders: Sequence[str], split: str | None = None) -> Sources:
+    """What the folders hold.
+
+    Args:
+        folders: each ``FOLDER`` or ``LABEL=FOLDER``; the label is what tables and figures call it.
+        split: whose evaluations are taken; None: validation, and of a study those that it made.
+
+    Raises:
+        UsageError: a folder that holds nothing of the kind, or from which something is missing.
+    """
+    sources = Sources()
+    for words in folders:
+        label, folder = parse_source(words)
+        if not folder.is_dir():
+            raise UsageError(f"{folder} is no folder: give folders that 'rl2grid' wrote.")
+        study = _study_folder(folder)
+        if study is not None and label is not None:
+            raise UsageError(f"A study has names of its own: give {folder} without {label}=.")
+        if study is not None:
+            _add_study(sources, study, split)
+        elif (folder / CELL_FILE).is_file():
+            _add_cell(sources, folder, label)
+        else:
+            _add_folder(sources, folder, label, split or VALIDATION)
+    return sources
+
+
+def parse_source(words: str) -> tuple[str | None, Path]:
+    """Label and folder; a folder whose own name has an equals sign is a folder.
+
+    Raises:
+        UsageError: the label or the folder is empty.
+    """
+    label, equals, folder = words.partition("=")
+    if not equals or Path(words).exists():
+        return None, Path(words)
+    if not label or not folder:
+        raise UsageError(f"{words!r} is not allowed: give FOLDER or LABEL=FOLDER.")
+    return label, Path(folder)
+
+
+def find_evaluations(folder: Path, split: str) -> list[Path]:
+    """The folder itself, or those below it of the split, which 'rl2grid evaluate' names after what else was asked."""
+    if (folder / EVALUATION_FILE).is_file():
+        return [folder]
+    below = (folder / EVALUATION_FOLDER).glob(f"{split}*")
+    return sorted(path for path in below if (path / EVALUATION_FILE).is_file())
+
+
+def _add_folder(sources: Sources, folder: Path, label: str | None, split: str) -> None:
+    evaluations = find_evaluations(folder, split)
+    sources.results += [_named(load_evaluation(evaluation), label) for evaluation in evaluations]
+    if (folder / RUN_FILE).is_file():
+        run = read_training_run(folder, label)
+        sources.runs.append(run)
+        if not evaluations:
+            sources.missing.append(
+                f"Run {folder} was not evaluated on {split}: rl2grid evaluate {folder} {run.task} --split {split}"
+            )
+    elif not evaluations:
+        raise UsageError(
+            f"{folder} holds neither a run nor a study nor an evaluation on {split}: give folders that "
+            "'rl2grid train', 'rl2grid study run' or 'rl2grid evaluate' wrote."
+        )
+
+
+def _study_folder(folder: Path) -> Path | None:
+    """The folder of a study, or that of its only scale."""
+    if (folder / STUDY_FILE).is_file():
+        return folder
+    scales = sorted(path.parent for path in folder.glob(f"*/{STUDY_FILE}"))
+    if len(scales) > 1:
+        raise UsageError(f"{folder} holds several studies: give one of {', '.join(map(str, scales))}.")
+    return scales[0] if scales else None
+
+
+def _add_study(sources: Sources, folder: Path, split: str | None) -> None:
+    taken = 0
+    for entry in _read_json(folder / STUDY_FILE)["cells"]:
+        cell = folder / CELLS_FOLDER / entry["cell"]
+        if not (cell / RESULT_FILE).is_file():
+            sources.missing.append(f"Cell {cell.name} of the study {folder} is not finished.")
+            continue
+        played = _read_json(cell / CELL_FILE)["split"]
+        if split not in (None, played):
+            sources.missing.append(f"Cell {cell.name} of the study {folder} was evaluated on {played}, not on {split}.")
+            continue
+        _add_cell(sources, cell, None)
+        taken += 1
+    if not taken:
+        wanted = "finished cell" if split is None else f"finished cell that was evaluated on {split}"
+        raise UsageError(f"The study {folder} has no {wanted} yet: 'rl2grid study status' says how far it is.")
+
+
+def _add_cell(sources: Sources, folder: Path, given: str | None) -> None:
+    """One cell of a study: under the label given, else under that of its group."""
+    cell = _read_json(folder / CELL_FILE)
+    label = given or _cell_label(cell)
+    sources.results.append(_named(load_evaluation(folder / EVALUATION_FOLDER), label))
+    if cell["training"] is not None:
+        curve = label if given or not label or not cell["heuristic"] else f"{label} + {cell['heuristic']}"
+        sources.runs.append(read_training_run(folder / RUN_FOLDER, curve))
+
+
+def _cell_label(cell: Mapping[str, Any]) -> str | None:
+    """Agent and label of the cell's group; None without a label. A cell is named after what it is made of."""
+    task, heuristic, training = cell["task"].removeprefix("rl2grid/"), cell["heuristic"], cell["training"]
+    before = "-".join(part for part in (task, cell["agent"], heuristic) if part)
+    after = "" if training is None else f"-{training['seed']}"
+    label = cell["name"].removeprefix(before).removesuffix(after).strip("-")
+    return f"{cell['agent']} {label}" if label else None
+
+
+def _named(result: EvaluationResult, label: str | None) -> EvaluationResult:
+    if label is None:
+        return result
+    return replace(result, episodes=tuple(replace(episode, agent=label) for episode in result.episodes))
+
+
+def _read_json(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise UsageError(f"{path} cannot be read as part of a study: {error}.") from None

@@ -1,0 +1,140 @@
+"""Aggregates of the episodes of one agent on one task."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rl2grid.mdp.constraints import THRESHOLDS
+from rl2grid.records.episodes import Episode
+from rl2grid.records.statistics import (
+    Estimate,
+    Floats,
+    Statistic,
+    interquartile_mean,
+    mean,
+    stratified_bootstrap,
+)
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Means are over episodes; their 95% intervals come from a bootstrap stratified by scenario.
+
+    They tell how a mean varies with the seeds. Where every scenario was played with one seed only, there is
+    nothing to resample within a scenario: then scenarios are, and intervals tell how a mean varies with them.
+    """
+
+    task: str
+    agent: str
+    heuristic: str
+    episodes: int
+    scenarios: int
+    seeds: int
+    """Of each scenario."""
+    survival: Estimate
+    """Mean share of the episode survived."""
+    survival_iqm: Estimate
+    """Interquartile mean of it."""
+    completed: Estimate
+    """Share of episodes completed."""
+    episode_return: Estimate
+    cost_lsi: Estimate
+    cost_tlo: Estimate
+    safe_lsi: Estimate
+    """P(cost ≤ threshold and episode completed): dying early is not safety."""
+    safe_tlo: Estimate
+    score_margin: Estimate
+    score_overload: Estimate
+    score_topology: Estimate
+    decisions: Estimate
+    """Per episode."""
+    grid_steps: Estimate
+    """Per episode."""
+    game_over: dict[str, int]
+    """Episodes per reason, completed ones left out."""
+    wall_time_s: float
+    """Sum over episodes."""
+
+
+def summarise(episodes: Sequence[Episode]) -> Summary:
+    """Aggregates of episodes of one agent on one task.
+
+    Raises:
+        ValueError: no episodes, or episodes of several agents or tasks, or seeds missing for some scenario.
+    """
+    subjects = {(episode.task, episode.agent, episode.heuristic) for episode in episodes}
+    if len(subjects) != 1:
+        raise ValueError(f"A summary is about one agent on one task, got episodes of {len(subjects)}.")
+    ((task, agent, heuristic),) = subjects
+
+    def of(column: str) -> Estimate:
+        return _estimate(by_scenario(episodes, column), mean)
+
+    reasons = Counter(episode.game_over for episode in episodes if not episode.completed)
+    return Summary(
+        task=task,
+        agent=agent,
+        heuristic=heuristic,
+        episodes=len(episodes),
+        scenarios=len({episode.scenario for episode in episodes}),
+        seeds=len({episode.seed for episode in episodes}),
+        survival=of("survival"),
+        survival_iqm=_estimate(by_scenario(episodes, "survival"), interquartile_mean),
+        completed=of("completed"),
+        episode_return=of("episode_return"),
+        cost_lsi=of("cost_lsi"),
+        cost_tlo=of("cost_tlo"),
+        safe_lsi=_estimate(safe_episodes(episodes, {"LSI": THRESHOLDS["LSI"]}), mean),
+        safe_tlo=_estimate(safe_episodes(episodes, {"TLO": THRESHOLDS["TLO"]}), mean),
+        score_margin=of("score_margin"),
+        score_overload=of("score_overload"),
+        score_topology=of("score_topology"),
+        decisions=of("decisions"),
+        grid_steps=of("grid_steps"),
+        game_over=dict(sorted(reasons.items())),
+        wall_time_s=sum(episode.wall_time_s for episode in episodes),
+    )
+
+
+def by_scenario(episodes: Sequence[Episode], column: str) -> Floats:
+    """A column of the episodes, float64 [scenario, seed].
+
+    Raises:
+        ValueError: some scenario was not played with every seed.
+    """
+    order = sorted(episodes, key=lambda episode: (episode.scenario, episode.seed))
+    n_scenarios = len({episode.scenario for episode in order})
+    keys = {(episode.scenario, episode.seed) for episode in order}
+    n_seeds = len({episode.seed for episode in order})
+    if len(keys) != len(order) or len(order) != n_scenarios * n_seeds:
+        raise ValueError("Every scenario must be played once with every seed.")
+    values = np.array([getattr(episode, column) for episode in order], dtype=np.float64)
+    return values.reshape(n_scenarios, n_seeds)
+
+
+def safe_episodes(episodes: Sequence[Episode], limits: Mapping[str, float]) -> Floats:
+    """Whether episodes were completed within all limits, 0 or 1, float64 [scenario, seed]: dying early is not safety.
+
+    Args:
+        episodes: of one agent on one task.
+        limits: largest cost by constraint (``"LSI"``, ``"TLO"``).
+
+    Raises:
+        ValueError: some scenario was not played with every seed.
+    """
+    safe: NDArray[np.bool_] = by_scenario(episodes, "completed") == 1
+    for constraint, limit in limits.items():
+        safe &= by_scenario(episodes, f"cost_{constraint.lower()}") <= limit
+    return safe.astype(np.float64)
+
+
+def _estimate(values: Floats, statistic: Statistic) -> Estimate:
+    """A statistic of values [scenario, seed] and its interval; see :class:`Summary`."""
+    n_scenarios, n_seeds = values.shape
+    strata = np.repeat(np.arange(n_scenarios), n_seeds).tolist() if n_seeds > 1 else None
+    return stratified_bootstrap(values.reshape(-1), statistic, strata=strata)

@@ -1,0 +1,1 @@
+"""Studies and searches: many trainings and evaluations from one file."""

@@ -1,0 +1,286 @@
+"""One cell of a study in its folder: trained, evaluated, and gone on with after any interruption.
+
+A cell's folder holds
+
+- ``cell.json``: what is asked for;
+- ``run/``: the training run, if the agent learns, see :mod:`rl2grid.training.runs`;
+- ``evaluation/``: the episodes, see :mod:`rl2grid.evaluation.protocol`;
+- ``log.txt``: what its processes printed;
+- ``result.json``: written at the very end.
+
+``python -m rl2grid.studies.cell <folder>`` does the work, on one thread. It stops with a checkpoint when it
+gets a termination signal or when its standard input is closed, which happens when the process that started it dies.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import traceback
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+
+from rl2grid.errors import UsageError
+from rl2grid.evaluation.flags import evaluate_command
+from rl2grid.evaluation.protocol import evaluate
+from rl2grid.records.episodes import EPISODES_FILE
+from rl2grid.records.files import write_json
+from rl2grid.records.sources import CELL_FILE, EVALUATION_FOLDER, RESULT_FILE, RUN_FOLDER
+from rl2grid.records.trainings import METRICS_FILE
+from rl2grid.studies.study import Cell, Training, cell_from_dict, cell_to_dict
+from rl2grid.training import runs
+from rl2grid.training.commands import train_command
+from rl2grid.training.validation import validator
+
+LOG_FILE, LOCK_FILE = "log.txt", ".lock"
+
+FINISHED, FAILED, REFUSED, BUSY, STOPPED = 0, 1, 2, 75, 130
+"""Exit statuses. ``REFUSED``: trying again is no use; ``BUSY``: another process has the cell; ``STOPPED``: asked to."""
+
+COMMAND: tuple[str, ...] = (sys.executable, "-m", "rl2grid.studies.cell")
+_SINGLE_THREADED = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+
+
+@dataclass(frozen=True)
+class CellResult:
+    """What is said of a finished cell."""
+
+    minutes: float
+    """Of training, validation and evaluation."""
+    identity: str
+    """Hash of the evaluation's identity."""
+    survival: float
+    """Mean over the evaluated episodes."""
+    episodes: int
+
+
+def prepare(folder: Path, cell: Cell) -> None:
+    """Make the folder of a cell.
+
+    Raises:
+        UsageError: it holds a cell of another definition.
+    """
+    wanted = json.loads(json.dumps(cell_to_dict(cell)))
+    path = folder / CELL_FILE
+    if not path.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        write_json(path, wanted)
+        return
+    stored = _read_json(path)
+    for key, value in wanted.items():
+        if stored.get(key) != value:
+            raise UsageError(
+                f"{folder} holds a cell with another {key}: remove it, or choose another folder with --output."
+            )
+
+
+def read_result(folder: Path) -> CellResult | None:
+    """The result of a finished cell; None if it is not finished."""
+    path = folder / RESULT_FILE
+    return CellResult(**_read_json(path)) if path.exists() else None
+
+
+def is_busy(folder: Path) -> bool:
+    """Whether a process works on the cell now."""
+    if not (folder / LOCK_FILE).exists():
+        return False
+    try:
+        with FileLock(folder / LOCK_FILE).acquire(timeout=0):
+            return False
+    except Timeout:
+        return True
+
+
+def commands(folder: Path, cell: Cell) -> list[str]:
+    """What to type to obtain the cell by hand."""
+    keywords, lines, agent = {"heuristic": cell.heuristic, **cell.environment}, [], cell.agent
+    if cell.training is not None:
+        run = folder / RUN_FOLDER
+        lines = [train_command(_run_args(cell, cell.training, run), cell.training.preset, run)]
+        agent = str(run)
+    return [*lines, evaluate_command(agent, cell.task, cell.split, cell.evaluation_seeds, cell.months, keywords)]
+
+
+def run_cell(folder: Path) -> None:
+    """Do what is missing of a cell.
+
+    Raises:
+        UsageError: what is asked for cannot be done.
+        KeyboardInterrupt: a signal asked to stop; calling this again goes on.
+        filelock.Timeout: another process works on it.
+    """
+    with FileLock(folder / LOCK_FILE).acquire(timeout=0):
+        if read_result(folder) is None:
+            _finish(folder)
+
+
+def _finish(folder: Path) -> None:
+    cell = cell_from_dict(_read_json(folder / CELL_FILE))
+    agent: str | Path = cell.agent
+    if cell.training is not None:
+        agent = folder / RUN_FOLDER
+        _train(cell, cell.training, folder / RUN_FOLDER)
+        if not runs.is_finished(folder / RUN_FOLDER):
+            raise KeyboardInterrupt
+    result = evaluate(
+        agent,
+        cell.task,
+        split=cell.split,
+        scenarios=cell.scenarios,
+        seeds=range(cell.evaluation_seeds),
+        heuristic=cell.heuristic,
+        workers=0,
+        output=folder / EVALUATION_FOLDER,
+        command=commands(folder, cell)[-1],
+        **cell.environment,
+    )
+    seconds = trained_seconds(folder / RUN_FOLDER) + sum(episode.wall_time_s for episode in result.episodes)
+    summary = CellResult(
+        minutes=round(seconds / 60.0, 2),
+        identity=result.episodes[0].identity,
+        survival=result.summary.survival.value,
+        episodes=len(result.episodes),
+    )
+    write_json(folder / RESULT_FILE, vars(summary))
+
+
+def _train(cell: Cell, training: Training, folder: Path) -> None:
+    if folder.exists():
+        if not runs.is_finished(folder):
+            runs.resume(folder, evaluate=validator(runs.read_config(folder)[0]))
+        return
+    args = _run_args(cell, training, folder)
+    runs.train(args, evaluate=validator(args))
+
+
+def _run_args(cell: Cell, training: Training, folder: Path) -> runs.RunArgs:
+    hyperparameters = training.resolved(cell.task)
+    native = cell.environment.get("engine", "native") == "native"
+    return runs.RunArgs(
+        task=cell.task,
+        hyperparameters=hyperparameters,
+        algorithm=training.algorithm,
+        folder=folder,
+        env_keywords={"heuristic": cell.heuristic, **cell.environment},
+        num_threads=1 if native else None,
+        num_workers=None if native else 0,
+        evaluate_every=max(hyperparameters.total_timesteps // training.validations, 1),
+        validation_months=cell.months,
+        progress=False,
+    )
+
+
+class CellProcess:
+    """A process that works on a cell."""
+
+    def __init__(self, folder: Path, command: Sequence[str] = COMMAND) -> None:
+        """Start it; what it prints goes to the cell's log."""
+        with (folder / LOG_FILE).open("a", encoding="utf-8") as log:
+            # A session of its own: Ctrl-C in a terminal reaches the study alone, which passes it on once.
+            self._process = subprocess.Popen(
+                [*command, str(folder)],
+                stdin=subprocess.PIPE,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, **_SINGLE_THREADED},
+                start_new_session=True,
+            )
+
+    def poll(self) -> int | None:
+        """The exit status; None while it works."""
+        return self._process.poll()
+
+    def stop(self) -> None:
+        """Ask it to write a checkpoint and end."""
+        # The same sign as the death of this process, so that both together count once.
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+
+    def wait(self) -> int:
+        """Wait for its end; returns the exit status."""
+        return self._process.wait()
+
+
+def work(folder: Path, command: Sequence[str] = COMMAND) -> int:
+    """Work on a cell in a process of its own and wait; returns its exit status."""
+    process = CellProcess(folder, command)
+    try:
+        return process.wait()
+    except BaseException:
+        process.stop()
+        process.wait()
+        raise
+
+
+def serve(do: Callable[[], None]) -> int:
+    """Do something until it is done, or until a signal or the end of the standard input; returns the exit status."""
+    try:
+        signal.signal(signal.SIGTERM, _interrupt)
+        threading.Thread(target=_stop_when_input_ends, daemon=True).start()
+        do()
+    except Timeout:
+        return BUSY
+    except KeyboardInterrupt:
+        return STOPPED
+    except UsageError as error:
+        print(f"rl2grid: {error}", file=sys.stderr)
+        return REFUSED
+    except Exception:
+        traceback.print_exc()
+        return FAILED
+    return FINISHED
+
+
+def trained_seconds(run: Path) -> float:
+    """Seconds that a run has taken so far, interruptions left out."""
+    path = run / METRICS_FILE
+    if not path.exists():
+        return 0.0
+    last = path.read_text(encoding="utf-8").strip().splitlines()[-1].split(",")
+    return float(last[2]) if last[2] != "wall_time" else 0.0
+
+
+def played_episodes(folder: Path) -> int:
+    """Episodes of the evaluation that are on disk."""
+    for name in (EPISODES_FILE, "episodes.partial.csv"):
+        path = folder / EVALUATION_FOLDER / name
+        if path.exists():
+            return max(path.read_text(encoding="utf-8").count("\n") - 1, 0)
+    return 0
+
+
+def last_error(folder: Path) -> str:
+    """The last line that the processes of a cell printed."""
+    path = folder / LOG_FILE
+    lines = path.read_text(encoding="utf-8", errors="replace").split("\n") if path.exists() else []
+    return next((line.strip() for line in reversed(lines) if line.strip()), "it left no message")
+
+
+def _read_json(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, json.JSONDecodeError) as error:
+        raise UsageError(f"{path} cannot be read as part of a study: {error}.") from None
+
+
+def _interrupt(number: int, frame: object) -> None:
+    raise KeyboardInterrupt
+
+
+def _stop_when_input_ends() -> None:
+    # Not by sys.stdin, whose lock this thread would hold while the interpreter shuts down.
+    while os.read(0, 1024):
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+if __name__ == "__main__":
+    sys.exit(serve(lambda: run_cell(Path(sys.argv[1]))))

@@ -1,0 +1,137 @@
+"""The demonstration: train, evaluate beside simple agents, and write a report, in a few minutes.
+
+Everything is written below one folder. The demonstration may be interrupted and started again: a
+training goes on from its checkpoint, an evaluation with the episodes that are missing.
+"""
+
+from __future__ import annotations
+
+import shlex
+import time
+from pathlib import Path
+
+import gymnasium
+from rich.console import Console
+
+from rl2grid.analysis.report import write_report
+from rl2grid.analysis.tables import rich_table
+from rl2grid.envs.registration import register_all
+from rl2grid.errors import UsageError
+from rl2grid.evaluation.agents import make_agent
+from rl2grid.evaluation.flags import flags
+from rl2grid.evaluation.protocol import evaluate
+from rl2grid.evaluation.recording import record_episode
+from rl2grid.records.evaluations import EvaluationResult
+from rl2grid.records.recordings import Recording
+from rl2grid.records.trainings import read_training_curve
+from rl2grid.scenarios.library import list_scenarios
+from rl2grid.training import runs
+from rl2grid.training.validation import validator
+
+TASK = "rl2grid/bus14-T0-v0"
+HEURISTIC = "idle"
+DECISIONS = 192_000
+"""Two to three minutes on two cores."""
+NUM_ENVS = 64
+"""Enough to keep the cores busy while some environments play hours of calm between two decisions."""
+SEEDS = (0,)
+"""Of maintenance and of the random agent: episodes per test month."""
+
+
+def run_demo(output: Path, decisions: int | None = None) -> Path:
+    """Train PPO with the idle heuristic on bus14, evaluate it on held-out months, write a report.
+
+    Args:
+        output: folder of the report, ``report.html`` in it; ``output / "run"`` holds the training.
+        decisions: how long to train.
+
+    Returns:
+        The report.
+
+    Raises:
+        UsageError: ``decisions`` is too small, or ``output`` holds a training of another length.
+    """
+    console, began = Console(), time.perf_counter()
+    register_all()
+    console.rule("1/4 Training PPO with the idle heuristic on bus14", align="left")
+    console.print("Whenever a line is loaded to 95%, the agent chooses one of 50 topology actions.")
+    run = _train(output / "run", DECISIONS if decisions is None else decisions)
+    if not runs.is_finished(run):
+        raise KeyboardInterrupt
+
+    console.rule("2/4 Playing 20 months that no agent has seen", align="left")
+    results = [_evaluate(agent, heuristic, output) for agent, heuristic in _contestants(run)]
+
+    console.rule("3/4 Recording one episode", align="left")
+    recording = _record(run)
+
+    console.rule("4/4 Writing the report", align="left")
+    report = write_report(
+        output,
+        results,
+        title="PPO on bus14",
+        introduction=(
+            "An agent that acts only when a line is loaded to 95%, trained for minutes, beside doing nothing and "
+            "acting at random, on 20 months that none of them has seen."
+        ),
+        curves=[read_training_curve(run, "PPO with the idle heuristic")],
+        recordings=[recording],
+        commands=dict.fromkeys(("training", "episodes"), demo_command(output, decisions)),
+    )
+    console.print(rich_table([result.summary for result in results], title=f"{TASK}, test scenarios"))
+    console.print(f"Report: {report} ({time.perf_counter() - began:.0f} s)")
+    return report
+
+
+def demo_command(output: Path, decisions: int | None) -> str:
+    """What to type for :func:`run_demo` to be called like that."""
+    length = {} if decisions is None else {"decisions": decisions}
+    return shlex.join(["rl2grid", "demo", *flags({**length, "output": output})])
+
+
+def _contestants(run: Path) -> list[tuple[str, str | None]]:
+    return [("do-nothing", None), ("random", HEURISTIC), (str(run), HEURISTIC)]
+
+
+def _train(folder: Path, decisions: int) -> Path:
+    """Begin the run, or go on with it; a complete run is left as it is."""
+    hyperparameters = runs.hyperparameters("ppo", TASK, total_timesteps=decisions, num_envs=NUM_ENVS)
+    if folder.exists():
+        stored, _ = runs.read_config(folder)
+        if stored.hyperparameters != hyperparameters:
+            raise UsageError(f"{folder} holds another training: remove it, or choose another folder with --output.")
+        return runs.resume(folder, evaluate=validator(stored))
+    args = runs.RunArgs(
+        task=TASK,
+        hyperparameters=hyperparameters,
+        folder=folder,
+        env_keywords={"heuristic": HEURISTIC},
+        evaluate_every=max(decisions // 8, 1),
+    )
+    return runs.train(args, evaluate=validator(args))
+
+
+def _evaluate(agent: str, heuristic: str | None, output: Path) -> EvaluationResult:
+    name = agent if agent in ("do-nothing", "random") else "PPO"
+    return evaluate(
+        agent,
+        TASK,
+        split="test",
+        seeds=SEEDS,
+        heuristic=heuristic,
+        output=output / "evaluation" / name,
+        progress=True,
+        name=name,
+        command=f"rl2grid evaluate {agent} {TASK} --split test --seeds {len(SEEDS)} --heuristic {heuristic}",
+    )
+
+
+def _record(run: Path) -> Recording:
+    scenario = list_scenarios("bus14", "test")[-1]
+    env = gymnasium.make(TASK, split="test", heuristic=HEURISTIC, disable_env_checker=True)
+    try:
+        agent = make_agent(run, TASK)
+        agent.bind(env)
+        return record_episode(agent, env, scenario=scenario)
+    finally:
+        env.close()

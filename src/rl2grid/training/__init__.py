@@ -1,0 +1,1 @@
+"""Training runs: their folders, validation, tracking and energy."""

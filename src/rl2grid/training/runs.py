@@ -1,0 +1,598 @@
+"""Training runs: one folder each, written so that a kill at any moment loses at most some minutes.
+
+A run folder holds
+
+- ``config.json``: the request, its identity (versions, hashes) and its seeds;
+- ``metrics.csv`` and ``tensorboard/``: see :mod:`rl2grid.algorithms.metrics`;
+- ``checkpoint.pt``: everything needed to go on, see :mod:`rl2grid.algorithms.checkpoint`;
+- ``replay/``: what DQN, SAC and TD3 remember, until the run is finished, see :mod:`rl2grid.algorithms.replay`;
+- ``best.pt``: the best policy on the validation scenarios so far, see :func:`score`;
+- ``energy.json``: energy and CO2, see :mod:`rl2grid.training.energy`;
+- ``wandb.json``, ``wandb/``: of a tracked run, see :mod:`rl2grid.training.tracking`;
+- ``log.txt``: what happened when.
+
+A run that was interrupted and resumed any number of times ends with the same weights, bit for bit, and
+the same metrics as one that was not (times apart), on the same machine with the same library versions.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager
+from dataclasses import asdict, dataclass, field, fields, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Protocol, get_type_hints
+
+import gymnasium
+from filelock import FileLock, Timeout
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from rl2grid.algorithms import dqn, lagrangian_ppo, ppo, sac, td3
+from rl2grid.algorithms.checkpoint import load_checkpoint, save_checkpoint
+from rl2grid.algorithms.metrics import MetricsWriter
+from rl2grid.algorithms.off_policy import OffPolicyTrainer
+from rl2grid.algorithms.policy_agent import BEST_FILE, CHECKPOINT_FILE, PolicyAgent
+from rl2grid.envs.registration import register_all
+from rl2grid.envs.tasks import CONSTRAINTS, Task, TaskOptions, constraint_of, find_task
+from rl2grid.errors import UsageError, one_of
+from rl2grid.evaluation.protocol import evenly_spread
+from rl2grid.mdp.actions import action_set_hash
+from rl2grid.mdp.constraints import THRESHOLDS
+from rl2grid.records.files import make_folder
+from rl2grid.records.versions import library_versions
+from rl2grid.scenarios.library import check_in_split, generator_version, scenario_pack_hash
+from rl2grid.scenarios.splits import TRAIN, VALIDATION
+from rl2grid.training.energy import EnergyAccount
+from rl2grid.training.interrupts import stop_requests
+from rl2grid.training.limits import TimeLimit
+from rl2grid.training.tracking import check_tracking, tracked
+
+CONFIG_FILE = "config.json"
+LOG_FILE = "log.txt"
+LOCK_FILE = ".lock"
+REPLAY_FOLDER = "replay"
+
+UNLIMITED = TimeLimit(None)
+
+VectorEnvironment = gymnasium.vector.VectorEnv[Any, Any, Any]
+Evaluate = Callable[[PolicyAgent], Mapping[str, float]]
+"""Plays the validation scenarios and returns means over them: ``survival``, under constraints also
+``safe_completed``, and whatever else is to be recorded."""
+Hyperparameters = ppo.Args | lagrangian_ppo.Args | dqn.Args | sac.Args | td3.Args
+
+
+class Trainer(Protocol):
+    """What a run needs of an algorithm in progress."""
+
+    num_iterations: int
+    decisions: int
+    grid_steps: int
+
+    @property
+    def finished(self) -> bool:
+        """Whether the budget of decisions is used up."""
+
+    def iterate(self) -> dict[str, float]:
+        """Play ``num_steps`` decisions in every environment, learn, and return the metrics."""
+
+    def policy_state(self) -> dict[str, Any]:
+        """All that is needed to act."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that is needed to go on, after an iteration."""
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on where ``state_dict`` was called, bit for bit."""
+
+
+@dataclass(frozen=True)
+class Algorithm:
+    """What a run needs to know of an algorithm."""
+
+    args: type[Hyperparameters]
+    """Its hyperparameters."""
+    trainer: Callable[[Any, VectorEnvironment], Trainer]
+    """Made of hyperparameters and environments."""
+    kinds: tuple[str, ...]
+    """Kinds of task that it can learn: ``"T"`` (discrete actions), ``"R"`` (continuous actions)."""
+    preset: Callable[..., Hyperparameters]
+    """``preset(name, continuous=..., **changes)``."""
+
+
+ALGORITHMS: dict[str, Algorithm] = {
+    "ppo": Algorithm(ppo.Args, ppo.PPO, ("T", "R"), ppo.preset),
+    "lagrangian-ppo": Algorithm(lagrangian_ppo.Args, lagrangian_ppo.LagrangianPPO, ("T", "R"), lagrangian_ppo.preset),
+    "dqn": Algorithm(dqn.Args, dqn.DQN, ("T",), dqn.preset),
+    "sac": Algorithm(sac.Args, sac.SAC, ("T", "R"), sac.preset),
+    "td3": Algorithm(td3.Args, td3.TD3, ("R",), td3.preset),
+}
+
+
+@dataclass(frozen=True)
+class RunArgs:
+    """What is to be trained, on what, and where."""
+
+    task: str
+    """Task id, such as ``rl2grid/bus14-T0-v0``; the namespace and the version may be left out."""
+    hyperparameters: Hyperparameters
+    """Of the algorithm, the seed and the budget among them; see :func:`hyperparameters`."""
+    algorithm: str = "ppo"
+    """Name of the algorithm."""
+    folder: Path | None = None
+    """Where the run is written, a folder that does not exist yet; None: ``runs/<task>-<algorithm>-<seed>``."""
+    env_keywords: Mapping[str, Any] = field(default_factory=dict)
+    """Keywords of ``gymnasium.make_vec`` (``heuristic``, ``reward``, ...); ``gamma`` is the algorithm's."""
+    num_threads: int | None = None
+    """Native engine: threads that play the environments; None: one per processor core. No influence on results."""
+    num_workers: int | None = None
+    """Reference engine: processes that play them; None: one per core, 0: this one. No influence on results."""
+    checkpoint_seconds: float = 60.0
+    """A checkpoint is written when the last one is older than this, and at the end."""
+    evaluate_every: int = 50_000
+    """Decisions between two evaluations on the validation scenarios; there is one more at the end."""
+    validation_months: int | None = None
+    """Validation scenarios that are played, evenly spread; None: all; 0: none, so that there is no ``best.pt``."""
+    tensorboard: bool = True
+    """Whether to write TensorBoard events beside ``metrics.csv``."""
+    wandb_project: str | None = None
+    """Project of Weights & Biases that gets the metrics; None: they stay here."""
+    progress: bool = True
+    """Whether to show a progress bar."""
+
+
+def hyperparameters(algorithm: str, task: str, preset: str = "default", **changes: Any) -> Hyperparameters:
+    """A preset of an algorithm for a task, some values changed.
+
+    Raises:
+        UsageError: no such algorithm, task, preset or hyperparameter, or an algorithm that cannot learn the task.
+    """
+    chosen = _checked_algorithm(algorithm, find_task(task))
+    known = [parameter.name for parameter in fields(chosen.args)]
+    for name in changes:
+        if name not in known:
+            raise one_of(f"Hyperparameter of {algorithm}", name, known)
+    return chosen.preset(preset, continuous=find_task(task).kind == "R", **changes)
+
+
+def kinds_of_hyperparameters(algorithm: str) -> dict[str, Any]:
+    """Type hint of every hyperparameter of an algorithm."""
+    args = ALGORITHMS[algorithm].args
+    hints = get_type_hints(args)
+    return {parameter.name: hints[parameter.name] for parameter in fields(args)}
+
+
+def find_limits(args: RunArgs) -> dict[str, float]:
+    """What the costs of a safe episode may reach, by constraint; empty without a constraint.
+
+    The constraint is the task's, or that of the keyword ``constraint``; Lagrangian PPO may have others of its own.
+
+    Raises:
+        UsageError: Lagrangian PPO without a constraint, or with one whose costs the environments do not report, or a
+            keyword that contradicts the task's id.
+    """
+    constraint = constraint_of(find_task(args.task), args.env_keywords.get("constraint"))
+    if isinstance(args.hyperparameters, lagrangian_ppo.Args):
+        limits = lagrangian_ppo.find_limits(args.hyperparameters, constraint)
+        for name in limits:
+            if name not in CONSTRAINTS:
+                raise one_of("Constraint", name, CONSTRAINTS)
+        return limits
+    return {constraint: THRESHOLDS[constraint]} if constraint else {}
+
+
+def find_folder(args: RunArgs) -> Path:
+    """Where a run is written."""
+    task = find_task(args.task).id.removeprefix("rl2grid/")
+    return Path(args.folder or Path("runs") / f"{task}-{args.algorithm}-{args.hyperparameters.seed}")
+
+
+def score(means: Mapping[str, float], limits: Mapping[str, float]) -> tuple[float, ...]:
+    """What the best policy has most of, in the order of importance; of equals the latest is kept.
+
+    Under constraints the share of validation episodes that were completed within all ``limits``, then survival;
+    without any, survival.
+    """
+    names = ("safe_completed", "survival") if limits else ("survival",)
+    return tuple(float(means[name]) for name in names)
+
+
+def make_envs(args: RunArgs) -> VectorEnvironment:
+    """The training environments of a run."""
+    register_all()
+    return gymnasium.make_vec(
+        find_task(args.task).id,
+        num_envs=args.hyperparameters.num_envs,
+        num_threads=args.num_threads,
+        num_workers=args.num_workers,
+        gamma=args.hyperparameters.gamma,
+        **args.env_keywords,
+    )
+
+
+def train(
+    args: RunArgs,
+    *,
+    evaluate: Evaluate | None = None,
+    limit: TimeLimit = UNLIMITED,
+    make_envs: Callable[[RunArgs], VectorEnvironment] = make_envs,
+) -> Path:
+    """Train from the beginning; returns the run folder.
+
+    Ctrl-C (or a termination signal) ends the run after the current iteration, with a checkpoint; a second
+    one at once. So does the time limit. In any case :func:`resume` goes on.
+
+    Args:
+        args: What to train.
+        evaluate: Validation, which picks ``best.pt``; None: only ``checkpoint.pt`` is written.
+        limit: When to stop; there is one iteration at least.
+        make_envs: Makes the training environments.
+
+    Raises:
+        UsageError: the request cannot be met; nothing was written.
+    """
+    args = _resolved(args)
+    folder = args.folder
+    assert folder is not None
+    if folder.exists():
+        raise UsageError(f"Folder {str(folder)!r} exists already: resume the run in it, or choose another folder.")
+    envs = make_envs(args)
+    try:
+        trainer = ALGORITHMS[args.algorithm].trainer(args.hyperparameters, envs)
+        identity = _identity(args)
+        _create_folder(folder, args, identity)
+        with _locked(folder):
+            _run(_Run(folder, args, identity, trainer, evaluate), envs, limit, None)
+    finally:
+        envs.close()
+    return folder
+
+
+def resume(
+    folder: Path,
+    *,
+    evaluate: Evaluate | None = None,
+    limit: TimeLimit = UNLIMITED,
+    make_envs: Callable[[RunArgs], VectorEnvironment] = make_envs,
+) -> Path:
+    """Go on with the run in ``folder``, from its last checkpoint (or the beginning, if there is none yet).
+
+    Raises:
+        UsageError: no run there, one that another process is writing, or one made of other data.
+    """
+    args, identity = read_config(folder)
+    check_tracking(args.wandb_project)
+    with _locked(folder):
+        now = _identity(args)
+        for name in ("grid_hash", "scenario_pack_hash", "action_set_hash"):
+            if identity.get(name) != now.get(name):
+                raise UsageError(
+                    f"The run in {str(folder)!r} cannot be resumed: its {name} was {identity.get(name)}, "
+                    f"now it is {now.get(name)}."
+                )
+        checkpoint = None
+        if (folder / CHECKPOINT_FILE).exists():
+            checkpoint = load_checkpoint(folder / CHECKPOINT_FILE, task=args.task)
+        envs = make_envs(args)
+        try:
+            trainer = ALGORITHMS[args.algorithm].trainer(args.hyperparameters, envs)
+            run = _Run(folder, args, now, trainer, evaluate)
+            if identity["versions"] != now["versions"]:
+                run.note(f"library versions differ from those the run began with: {now['versions']}")
+            _run(run, envs, limit, checkpoint)
+        finally:
+            envs.close()
+    return folder
+
+
+def read_config(folder: Path) -> tuple[RunArgs, dict[str, Any]]:
+    """The request and the identity stored in a run folder.
+
+    Raises:
+        UsageError: the folder holds no run.
+    """
+    path = folder / CONFIG_FILE
+    try:
+        config = json.loads(path.read_text(encoding="utf-8"))
+        request = dict(config["request"])
+        algorithm = ALGORITHMS[request["algorithm"]]
+        request["hyperparameters"] = algorithm.args(**_tuples(request["hyperparameters"]))
+        request["env_keywords"] = _tuples(request["env_keywords"])
+        return RunArgs(**request, folder=folder), config["identity"]
+    except FileNotFoundError as error:
+        raise UsageError(f"Folder {str(folder)!r} holds no run: there is no {CONFIG_FILE} in it.") from error
+    except (json.JSONDecodeError, KeyError, TypeError) as error:
+        raise UsageError(f"File {str(path)!r} does not describe a run of this version of rl2grid.") from error
+
+
+def is_finished(folder: Path) -> bool:
+    """Whether the run in ``folder`` used up its budget, so that there is nothing to resume."""
+    checkpoint = folder / CHECKPOINT_FILE
+    return checkpoint.exists() and bool(load_checkpoint(checkpoint)["run"]["finished"])
+
+
+class _Run:
+    """A run in progress: its folder, its trainer and what was reached so far."""
+
+    def __init__(
+        self,
+        folder: Path,
+        args: RunArgs,
+        identity: Mapping[str, Any],
+        trainer: Trainer,
+        evaluate: Evaluate | None,
+    ) -> None:
+        self.folder = folder
+        self.args = args
+        self.identity = identity
+        self.trainer = trainer
+        self.evaluate = evaluate
+        self.limits = find_limits(args)
+        self.best_score: tuple[float, ...] | None = None
+        """Of ``best.pt``; see :func:`score`."""
+        self.wall_time = 0.0
+        """Seconds of training and validation, those before interruptions included."""
+
+    def contents(self) -> dict[str, Any]:
+        """The sections of a checkpoint, without ``training``."""
+        return {
+            "algorithm": self.args.algorithm,
+            "task": self.args.task,
+            "env_keywords": dict(self.args.env_keywords),
+            "hyperparameters": asdict(self.args.hyperparameters),
+            "identity": dict(self.identity),
+            "decisions": self.trainer.decisions,
+            "policy": self.trainer.policy_state(),
+        }
+
+    def save(self) -> None:
+        """Write ``checkpoint.pt``."""
+        run = {
+            "best_score": self.best_score,
+            "wall_time": self.wall_time,
+            "finished": self.trainer.finished,
+        }
+        contents = {**self.contents(), "training": self.trainer.state_dict(), "run": run}
+        save_checkpoint(self.folder / CHECKPOINT_FILE, contents)
+
+    def load(self, checkpoint: Mapping[str, Any]) -> None:
+        """Be where the run was when ``checkpoint`` was written."""
+        try:
+            self.best_score, self.wall_time = checkpoint["run"]["best_score"], checkpoint["run"]["wall_time"]
+            self.trainer.load_state_dict(checkpoint["training"])
+        except KeyError as error:
+            raise UsageError(
+                f"The checkpoint in {str(self.folder)!r} lacks {error}, because another version of rl2grid wrote it: "
+                "go on with that version, or begin a new run."
+            ) from error
+
+    def validate(self) -> dict[str, float]:
+        """Evaluate the policy as it is, and keep it if it is the best so far."""
+        assert self.evaluate is not None
+        contents = self.contents()
+        result = self.evaluate(PolicyAgent(contents))
+        reached = score(result, self.limits)
+        # Of equally good policies the latest: it has learned from more than the validation scenarios show.
+        if self.best_score is None or reached >= self.best_score:
+            self.best_score = reached
+            save_checkpoint(self.folder / BEST_FILE, {**contents, "run": {"score": reached}})
+            safe = f"{result['safe_completed']:.2%} safe and completed, " if self.limits else ""
+            self.note(
+                f"best validation so far: {safe}survival {result['survival']:.4f}, "
+                f"after {self.trainer.decisions} decisions"
+            )
+        return {f"validation/{name}": float(value) for name, value in result.items()}
+
+    @property
+    def best_survival(self) -> float | None:
+        """Validation survival of ``best.pt``."""
+        return None if self.best_score is None else self.best_score[-1]
+
+    def note(self, text: str) -> None:
+        """Append a line to the log."""
+        with (self.folder / LOG_FILE).open("a", encoding="utf-8") as log:
+            log.write(f"{datetime.now(UTC).isoformat(timespec='seconds')} {text}\n")
+
+
+def _run(run: _Run, envs: VectorEnvironment, limit: TimeLimit, checkpoint: Mapping[str, Any] | None) -> None:
+    """Train until the budget is used up, a signal asks to stop or the time is up; closes the environments."""
+    args, trainer = run.args, run.trainer
+    if isinstance(trainer, OffPolicyTrainer):
+        trainer.store_in(run.folder / REPLAY_FOLDER)
+    if checkpoint is not None:
+        run.load(checkpoint)
+    run.note(f"{'resumed' if checkpoint else 'started'} at {trainer.decisions} of {_budget(args, trainer)} decisions")
+    after_step = trainer.decisions if checkpoint is not None else -1
+    saved_at, saved_decisions = time.monotonic(), trainer.decisions
+    config = {"request": _request(args), "identity": dict(run.identity)}
+    with (
+        closing(MetricsWriter(run.folder, after_step=after_step, tensorboard=args.tensorboard)) as metrics,
+        tracked(run.folder, args.wandb_project, config) as track,
+        _accounted(run.folder, trainer, envs) as energy,
+        stop_requests() as stop,
+        _progress_bar(args, trainer) as show,
+    ):
+        while not trainer.finished and not stop.is_set():
+            began, decisions, grid_steps = time.perf_counter(), trainer.decisions, trainer.grid_steps
+            values = trainer.iterate()
+            seconds = time.perf_counter() - began
+            values["charts/SPS"] = (trainer.decisions - decisions) / seconds
+            values["charts/grid_SPS"] = (trainer.grid_steps - grid_steps) / seconds
+            due = trainer.decisions // args.evaluate_every > decisions // args.evaluate_every
+            validated = run.evaluate is not None and (due or trainer.finished)
+            if validated:
+                values |= run.validate()
+            run.wall_time += time.perf_counter() - began
+            metrics.write(trainer.decisions, trainer.grid_steps, run.wall_time, values)
+            track(trainer.decisions, values)
+            show(values.get("charts/survival"), run.best_survival)
+            if validated or time.monotonic() - saved_at >= args.checkpoint_seconds:
+                run.save()
+                energy.save()
+                saved_at, saved_decisions = time.monotonic(), trainer.decisions
+            if limit.reached:
+                break
+        if trainer.decisions != saved_decisions:
+            run.save()
+        if trainer.finished:
+            shutil.rmtree(run.folder / REPLAY_FOLDER, ignore_errors=True)
+    run.note(f"{'finished' if trainer.finished else 'stopped'} at {trainer.decisions} decisions")
+
+
+@contextmanager
+def _accounted(folder: Path, trainer: Trainer, envs: VectorEnvironment) -> Iterator[EnergyAccount]:
+    """The energy account of a run, complete at the end; closes the environments."""
+    account, decisions = EnergyAccount(folder), trainer.decisions
+    try:
+        yield account
+    finally:
+        # The processor time of worker processes is known once they have ended.
+        envs.close()
+        if trainer.decisions > decisions:
+            account.finish()
+
+
+def _budget(args: RunArgs, trainer: Trainer) -> int:
+    """Decisions of the whole run: the largest number of full iterations within the request."""
+    return trainer.num_iterations * args.hyperparameters.num_envs * args.hyperparameters.num_steps
+
+
+@contextmanager
+def _progress_bar(args: RunArgs, trainer: Trainer) -> Iterator[Callable[[float | None, float | None], None]]:
+    """A bar with rate, ETA and survival; yields what to call after every iteration."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("decisions, {task.fields[rate]}/s, survival {task.fields[survival]}, best {task.fields[best]}, ETA"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, disable=not args.progress) as progress:
+        bar = progress.add_task(
+            f"{args.algorithm} on {args.task}",
+            total=_budget(args, trainer),
+            completed=trainer.decisions,
+            rate="-",
+            survival="-",
+            best="-",
+        )
+        began, first = time.perf_counter(), trainer.decisions
+
+        def show(survival: float | None, best: float | None) -> None:
+            progress.update(
+                bar,
+                completed=trainer.decisions,
+                rate=f"{(trainer.decisions - first) / (time.perf_counter() - began):.0f}",
+                survival="-" if survival is None else f"{survival:.2f}",
+                best="-" if best is None else f"{best:.2f}",
+            )
+
+        yield show
+
+
+def _resolved(args: RunArgs) -> RunArgs:
+    """The same request with everything filled in that a default decides, checked."""
+    task = find_task(args.task)
+    _checked_algorithm(args.algorithm, task)
+    keywords = dict(args.env_keywords)
+    if "gamma" in keywords:
+        raise UsageError("gamma belongs to the algorithm's hyperparameters, not to the environment's keywords.")
+    allowed = [option.name for option in fields(TaskOptions) if option.name != "gamma"]
+    for name in keywords:
+        if name not in allowed:
+            raise one_of("Environment keyword", name, allowed)
+    if callable(keywords.get("reward")):
+        raise UsageError("A run stores its reward by name: choose a preset or three weights, not a function.")
+    # Every keyword is stored, so that the run stays what it is when a default changes.
+    keywords = {name: getattr(TaskOptions(**keywords), name) for name in allowed}
+    if keywords["split"] != TRAIN:
+        raise UsageError(f"Training on the {keywords['split']} scenarios is refused: choose split {TRAIN!r}.")
+    if keywords["scenario"] is not None:
+        check_in_split(task.grid_id, TRAIN, keywords["scenario"])
+    if args.evaluate_every < 1:
+        raise UsageError(f"evaluate_every must be at least 1 decision, not {args.evaluate_every}.")
+    if args.validation_months != 0:
+        evenly_spread(task.id, VALIDATION, args.validation_months)
+    check_tracking(args.wandb_project)
+    resolved = replace(args, task=task.id, folder=find_folder(args), env_keywords=keywords)
+    find_limits(resolved)  # refuses what cannot be constrained
+    return resolved
+
+
+def _checked_algorithm(name: str, task: Task) -> Algorithm:
+    if name not in ALGORITHMS:
+        raise one_of("Algorithm", name, tuple(ALGORITHMS))
+    algorithm = ALGORITHMS[name]
+    if task.kind not in algorithm.kinds:
+        able = [other for other, candidate in ALGORITHMS.items() if task.kind in candidate.kinds]
+        raise UsageError(
+            f"Algorithm {name!r} cannot learn {task.id}, which has {_ACTIONS[task.kind]} actions: "
+            f"choose one of {', '.join(able)}."
+        )
+    return algorithm
+
+
+_ACTIONS = {"T": "discrete", "R": "continuous"}
+
+
+def _identity(args: RunArgs) -> dict[str, Any]:
+    """What results of this run must name (the normaliser's hash changes with training: checkpoints know it)."""
+    task = find_task(args.task)
+    return {
+        "task": task.id,
+        "engine": args.env_keywords["engine"],
+        "grid_hash": task.grid.hash,
+        "generator_version": generator_version(args.env_keywords["split"]),
+        "scenario_pack_hash": scenario_pack_hash(task.grid_id, args.env_keywords["split"]),
+        "action_set_hash": action_set_hash(task.grid, task.level) if task.kind == "T" else None,
+        "versions": library_versions(),
+        "seed": args.hyperparameters.seed,
+    }
+
+
+def _create_folder(folder: Path, args: RunArgs, identity: Mapping[str, Any]) -> None:
+    """Make the run folder with its configuration: it appears complete or not at all."""
+    seeds = {
+        "algorithm": args.hyperparameters.seed,
+        "first_environment": args.hyperparameters.seed * args.hyperparameters.num_envs,
+    }
+    config = {"request": _request(args), "identity": dict(identity), "seeds": seeds}
+    make_folder(folder.parent)
+    temporary = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
+    try:
+        temporary.mkdir()
+        (temporary / CONFIG_FILE).write_text(json.dumps(config, indent=2) + "\n", encoding="utf-8")
+        os.rename(temporary, folder)
+    except OSError as error:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise UsageError(f"Folder {str(folder)!r} cannot be made: {error.strerror}.") from error
+
+
+def _request(args: RunArgs) -> dict[str, Any]:
+    """The request as it is stored: wherever the folder is, it is the same run."""
+    request = asdict(args)
+    del request["folder"]
+    return request
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Keep other processes from writing into a run folder; the lock goes with this process, however it ends."""
+    lock = FileLock(folder / LOCK_FILE)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout as error:
+        raise UsageError(f"Folder {str(folder)!r} is being written by another process: wait until it ends.") from error
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def _tuples(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Values read from JSON, where tuples are stored as lists."""
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}

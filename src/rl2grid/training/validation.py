@@ -1,0 +1,54 @@
+"""Validation: what picks the best policy of a run while it is trained."""
+
+from __future__ import annotations
+
+from rl2grid.algorithms.policy_agent import PolicyAgent
+from rl2grid.evaluation.protocol import evaluate, evenly_spread
+from rl2grid.records.summary import safe_episodes
+from rl2grid.training import runs
+
+OF_TRAINING = ("split", "scenario", "gamma", "reward")
+"""Keywords of the training environments that validation does not take over."""
+
+
+def validator(args: runs.RunArgs) -> runs.Evaluate:
+    """A function that plays the validation scenarios as the run plays its own and returns means over episodes.
+
+    It returns ``survival``, ``completed``, ``episodic_return``, ``cost_lsi``, ``cost_tlo`` and ``decisions``, and
+    under constraints ``safe_completed``, P(cost ≤ threshold and episode completed) with the thresholds of
+    :func:`rl2grid.training.runs.find_limits`.
+
+    Args:
+        args: the run: its task, its keywords of the environment and its number of processes are those of validation,
+            with the default rewards.
+
+    Raises:
+        UsageError: the run cannot be constrained as asked.
+    """
+    limits = runs.find_limits(args)
+    scenarios = evenly_spread(args.task, "validation", args.validation_months)
+    keywords = {name: value for name, value in args.env_keywords.items() if name not in OF_TRAINING}
+
+    def validate(agent: PolicyAgent) -> dict[str, float]:
+        result = evaluate(agent, args.task, scenarios=scenarios, workers=args.num_workers, **keywords)
+        summary = result.summary
+        means = {
+            "survival": summary.survival.value,
+            "completed": summary.completed.value,
+            "episodic_return": summary.episode_return.value,
+            "cost_lsi": summary.cost_lsi.value,
+            "cost_tlo": summary.cost_tlo.value,
+            "decisions": summary.decisions.value,
+        }
+        return {**means, "safe_completed": float(safe_episodes(result.episodes, limits).mean())} if limits else means
+
+    return validate
+
+
+def find_validator(args: runs.RunArgs) -> runs.Evaluate | None:
+    """The :func:`validator` of a run; None for one that asks for no validation.
+
+    Raises:
+        UsageError: the run cannot be constrained as asked.
+    """
+    return None if args.validation_months == 0 else validator(args)

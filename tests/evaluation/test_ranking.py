@@ -1,0 +1,145 @@
+"""The ranking rule on hand-made cases, and a small ranking run from end to end."""
+
+import json
+
+import numpy as np
+import pytest
+
+from rl2grid.errors import UsageError
+from rl2grid.evaluation import ranking
+from rl2grid.evaluation.ranking import Trials, rank, run_ranking, score
+
+INF, NAN = np.inf, np.nan
+
+
+def trials(loadings, base) -> Trials:
+    return Trials(np.array(loadings, np.float32), np.array(base, float))
+
+
+def order(loadings, base, n_covered=0):
+    tried = trials(loadings, base)
+    return rank(tried, score(tried), n_covered).tolist()
+
+
+def test_scores_count_what_was_tried():
+    scores = score(trials([[1.0, INF, 0.7, NAN], [0.8, 0.9, NAN, NAN]], [1.0, 0.8]))
+    assert scores.trials.tolist() == [2, 2, 1, 0]
+    assert scores.survived.tolist() == [2, 1, 1, 0]
+    np.testing.assert_allclose(scores.margin, [0.1, 0.1, 0.3, 0.0], atol=1e-6)
+    np.testing.assert_allclose(scores.relief, [0.0, (-1 - 0.1) / 2, 0.15, 0.0], atol=1e-6)
+
+
+def test_margins_are_clipped():
+    scores = score(trials([[1.0, 7.0]], [1.0]))
+    assert scores.margin[1] == -1.0
+    assert scores.relief[1] == -1.0
+
+
+def test_equals_follow_by_mean_relief():
+    assert order([[1.0, 0.9, 0.7, 1.2], [1.0, 0.9, 0.8, 1.0]], [1.0, 1.0]) == [2, 1, 3]
+
+
+def test_survival_comes_before_margin():
+    assert order([[1.0, INF, 1.9]], [1.0]) == [2, 1]
+    assert order([[1.0, INF, 0.99], [1.0, 0.1, 0.99]], [1.0, 1.0]) == [2, 1]
+
+
+def test_survival_rates_count_to_the_percent():
+    """One collapse in 300 is noise, two in 100 are not."""
+    helpful, idle = [0.5] * 299, [1.0] * 300
+    assert order(np.stack([idle, [*helpful, INF], idle]).T, np.ones(300)) == [1, 2]
+    assert order(np.stack([idle[:100], [*helpful[:98], INF, INF], idle[:100]]).T, np.ones(100)) == [2, 1]
+
+
+def test_an_action_that_was_never_tried_comes_last():
+    assert order([[1.0, NAN, INF, 1.5]], [1.0]) == [3, 2, 1]
+
+
+def test_the_second_choice_helps_where_the_first_does_not():
+    # Actions 1 and 2 are best in the first two operating points, action 3 in the last one only.
+    loadings = [[1.0, 0.70, 0.71, 1.0], [1.0, 0.70, 0.71, 1.0], [1.0, 1.0, 1.0, 0.70]]
+    assert order(loadings, [1.0] * 3, 0) == [1, 2, 3]
+    assert order(loadings, [1.0] * 3, 2) == [1, 3, 2]
+
+
+def test_coverage_does_not_buy_a_dangerous_action():
+    helpful, dangerous = [1.0, 0.9, 1.0], [1.0, 1.0, 0.5]
+    collapses = [[1.0, 1.0, INF]] * 10
+    assert order([helpful, dangerous, *collapses], [1.0] * 12, 2)[0] == 1
+
+
+def test_coverage_goes_on_with_the_next_survival_rate():
+    assert order([[1.0, INF, 0.9], [1.0, 0.5, 0.9]], [1.0, 1.0], 2) == [2, 1]
+
+
+def test_calm_points_need_no_coverage():
+    loadings = [[0.5, 0.3, 0.5], [1.0, 1.0, 0.9]]
+    assert order(loadings, [0.5, 1.0], 1)[0] == 2
+
+
+def test_an_action_that_is_not_allowed_does_nothing():
+    assert order([[1.0, NAN, 0.9], [1.0, 0.99, 0.99]], [1.0, 1.0]) == [2, 1]
+
+
+def test_every_action_but_do_nothing_is_ranked_once():
+    rng = np.random.default_rng(0)
+    loadings = rng.uniform(0.5, 1.5, (20, 60))
+    loadings[rng.random(loadings.shape) < 0.1] = INF
+    assert sorted(order(loadings, rng.uniform(0.8, 1.2, 20), 10)) == list(range(1, 60))
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("ranking")
+    return run_ranking("bus14", states=8, seed=3, output=folder, work=folder / "work")
+
+
+def test_a_run_writes_a_ranking(finished):
+    with np.load(finished) as arrays:
+        ids, counts, metadata = arrays["ids"], arrays["trials"], json.loads(str(arrays["metadata"]))
+        assert (arrays["survived"] <= counts).all()
+        assert (np.abs(arrays["margin"]) <= 1).all()
+    assert ids.dtype == np.int32
+    assert sorted(ids.tolist()) == list(range(1, 209))
+    assert counts[0] == 8
+    assert counts.max() <= 8
+    assert metadata["version"] == ranking.VERSION
+    assert metadata["command"] == "rl2grid rank bus14 --states 8 --seed 3 --sampling exhaustive"
+    assert sum(metadata["states"].values()) == 8
+    assert metadata["trials"] == counts.sum()
+    assert metadata["levels_shared_by_halves"].keys() == {"50"}
+
+
+def test_a_run_that_was_interrupted_gives_the_same_with_any_number_of_threads(finished, monkeypatch, tmp_path):
+    work = finished.parent / "work"
+    (saved,) = work.iterdir()
+    for file in [*sorted(saved.glob("trials_*"))[3:], *sorted(saved.glob("episode_*"))[1:]]:
+        file.unlink()
+    again = run_ranking("bus14", states=8, seed=3, output=tmp_path, work=work, num_threads=2)
+    assert again.read_bytes() == finished.read_bytes()
+
+
+def test_what_is_there_is_not_tried_again(finished, monkeypatch, tmp_path):
+    monkeypatch.setattr(ranking._Laboratory, "loadings", None)
+    run_ranking("bus14", states=8, seed=3, output=tmp_path, work=finished.parent / "work")
+
+
+def test_uniform_sampling_tries_a_tenth(tmp_path):
+    with np.load(run_ranking("bus14", 12, 3, "uniform", tmp_path, tmp_path / "work")) as arrays:
+        share = arrays["trials"].sum() / (12 * 209)
+    # Five standard deviations of a share of a tenth of 2508.
+    assert abs(share - 0.1) < 5 * np.sqrt(0.09 / 2508)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"grid_id": "bus15"}, "choose one of bus14"),
+        ({"grid_id": "bus14", "states": 1}, "give at least 2"),
+        ({"grid_id": "bus14", "seed": -1}, "give 0 or more"),
+        ({"grid_id": "bus14", "sampling": "lucky"}, "choose one of exhaustive, uniform"),
+    ],
+)
+def test_bad_requests_are_refused(arguments, message):
+    with pytest.raises(UsageError, match=message):
+        run_ranking(**arguments)

@@ -1,0 +1,97 @@
+"""What tables and figures are made from: runs, evaluations and studies as they lie in folders."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import asdict, replace
+
+import pytest
+from sample_folders import CELLS, cell, write_made_up_evaluation, write_made_up_run, write_made_up_study
+from sample_results import TASK
+
+from rl2grid.errors import UsageError
+from rl2grid.records.episodes import EPISODES_FILE
+from rl2grid.records.sources import load_sources
+
+
+def test_runs_bring_their_evaluations_on_the_split(tmp_path):
+    write_made_up_run(tmp_path / "run")
+    for name in ("validation", "validation-idle", "test"):
+        write_made_up_evaluation(tmp_path / "run" / "evaluation" / name)
+    sources = load_sources([str(tmp_path / "run")])
+    assert [one.folder.name for one in sources.results if one.folder] == ["validation", "validation-idle"]
+    assert [(run.curve.label, run.seed) for run in sources.runs] == [("ppo + idle", 1)]
+    assert sources.missing == []
+    assert len(load_sources([str(tmp_path / "run")], "test").results) == 1
+
+
+def test_what_a_run_lacks_is_told(tmp_path):
+    write_made_up_run(tmp_path / "run")
+    sources = load_sources([f"mine={tmp_path / 'run'}"])
+    assert sources.results == []
+    assert sources.runs[0].curve.label == "mine"
+    assert sources.missing == [
+        f"Run {tmp_path / 'run'} was not evaluated on validation: rl2grid evaluate {tmp_path / 'run'} {TASK} "
+        "--split validation"
+    ]
+
+
+def test_a_study_brings_every_finished_cell_under_its_name(tmp_path):
+    unfinished = cell("bus14-T0-v0-ppo-idle-3", seed=3, finished=False)
+    write_made_up_study(tmp_path, [*map(dict, CELLS), unfinished])
+    sources = load_sources([str(tmp_path)])
+    agents = [one.episodes[0].agent for one in sources.results]
+    assert agents == ["ppo", "ppo", "ppo small-nets", "do-nothing"]
+    labels = [(run.curve.label, run.seed) for run in sources.runs]
+    assert labels == [("ppo + idle", 1), ("ppo + idle", 2), ("ppo small-nets + idle", 1)]
+    assert sources.missing == [f"Cell bus14-T0-v0-ppo-idle-3 of the study {tmp_path} is not finished."]
+
+
+def test_the_only_scale_of_a_study_is_found(tmp_path):
+    write_made_up_study(tmp_path / "quick", [dict(CELLS[0])])
+    assert len(load_sources([str(tmp_path)]).results) == 1
+    write_made_up_study(tmp_path / "full", [dict(CELLS[0])])
+    with pytest.raises(UsageError, match=r"holds several studies: give one of .*full, .*quick"):
+        load_sources([str(tmp_path)])
+
+
+def test_a_cell_of_a_study_is_a_folder_like_others(tmp_path):
+    write_made_up_study(tmp_path, [dict(one) for one in CELLS])
+    sources = load_sources([str(tmp_path / "cells" / CELLS[2]["name"])])
+    assert [one.episodes[0].agent for one in sources.results] == ["ppo small-nets"]
+    assert len(sources.runs) == 1
+    named = load_sources([f"mine={tmp_path / 'cells' / CELLS[2]['name']}"])
+    assert named.results[0].episodes[0].agent == named.runs[0].curve.label == "mine"
+
+
+def test_a_label_renames_episodes_alone(tmp_path):
+    write_made_up_evaluation(tmp_path / "one")
+    named, plain = (load_sources([words]).results[0] for words in (f"mine={tmp_path / 'one'}", str(tmp_path / "one")))
+    assert [asdict(episode) for episode in named.episodes] == [
+        asdict(replace(episode, agent="mine")) for episode in plain.episodes
+    ]
+    assert named.identity == plain.identity
+
+
+@pytest.mark.parametrize(
+    ("words", "split", "part"),
+    [
+        ("{}/nothing", None, "is no folder"),
+        ("{}/empty", None, "holds neither a run nor a study nor an evaluation on validation"),
+        ("{}/torn", None, "torn --output /"),
+        ("{}/run", None, "metrics.csv is no metrics file"),
+        ("{}/study", "train", "has no finished cell that was evaluated on train yet"),
+        ("mine={}/study", None, "A study has names of its own"),
+        ("={}/study", None, "give FOLDER or LABEL=FOLDER"),
+    ],
+)
+def test_refusals_are_one_sentence(tmp_path, words, split, part):
+    (tmp_path / "empty").mkdir()
+    write_made_up_evaluation(tmp_path / "torn")
+    (tmp_path / "torn" / EPISODES_FILE).unlink()
+    write_made_up_run(tmp_path / "run")
+    (tmp_path / "run" / "metrics.csv").unlink()
+    write_made_up_study(tmp_path / "study", [dict(CELLS[0])])
+    with pytest.raises(UsageError, match=re.escape(part)) as refusal:
+        load_sources([words.format(tmp_path)], split)
+    assert "\n" not in str(refusal.value)

@@ -1,0 +1,533 @@
+"""Training runs: what a folder holds, what is refused, and that a kill at any moment changes nothing."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from toy_grid import ToyGrid
+
+import rl2grid
+from rl2grid.algorithms.checkpoint import load_checkpoint, save_checkpoint
+from rl2grid.algorithms.policy_agent import PolicyAgent, load_agent
+from rl2grid.algorithms.ppo import Args
+from rl2grid.errors import UsageError
+from rl2grid.training import runs
+from rl2grid.training.runs import RunArgs, find_limits, hyperparameters, is_finished, read_config, resume, train
+
+SMALL = Args(
+    seed=5,
+    total_timesteps=4 * 8 * 12,
+    num_envs=4,
+    num_steps=8,
+    gamma=0.9,
+    update_epochs=2,
+    actor_layers=(8,),
+    critic_layers=(8,),
+)
+MISSPELT = hyperparameters("lagrangian-ppo", "bus14-T0", constraints=("LIS",), thresholds=(1.0,))
+TIMES = ["charts/SPS", "charts/grid_SPS", "charts/environment_share"]
+
+
+def request(folder: Path, **changes: Any) -> RunArgs:
+    request = RunArgs(
+        task="bus14-T0",
+        hyperparameters=SMALL,
+        folder=folder,
+        env_keywords={"heuristic": "idle", "reward": (1.0, 0.5, 0.25)},
+        checkpoint_seconds=0.0,
+        evaluate_every=96,
+        tensorboard=False,
+        progress=False,
+    )
+    return replace(request, **changes)
+
+
+def toy_envs(args: RunArgs) -> ToyGrid:
+    continuous = "-R-" in args.task
+    return ToyGrid(args.hyperparameters.num_envs, gamma=args.hyperparameters.gamma, continuous=continuous)
+
+
+def falling(agent: PolicyAgent) -> Mapping[str, float]:
+    """A validation that likes the policy after 96 decisions best."""
+    return {"survival": 1.0 - abs(agent.identity["decisions"] - 96) / 1000, "return": 2.0}
+
+
+def table(folder: Path) -> pd.DataFrame:
+    """The metrics of a run that do not depend on the speed of the machine."""
+    metrics = pd.read_csv(folder / "metrics.csv").drop(columns="wall_time")
+    return metrics[~metrics["name"].isin(TIMES)].reset_index(drop=True)
+
+
+def assert_same_run(mine: Path, theirs: Path) -> None:
+    """The same weights, optimiser, random states, environments, counters, metrics and best policy."""
+    assert_same(*(load_checkpoint(folder / "checkpoint.pt")["training"] for folder in (mine, theirs)))
+    assert_same(*(load_checkpoint(folder / "checkpoint.pt")["policy"] for folder in (mine, theirs)))
+    pd.testing.assert_frame_equal(table(mine), table(theirs), check_exact=True)
+    if (theirs / "best.pt").exists():
+        assert_same(*(load_checkpoint(folder / "best.pt")["policy"] for folder in (mine, theirs)))
+
+
+def assert_same(mine: Any, theirs: Any, where: str = "") -> None:
+    if isinstance(mine, dict):
+        assert mine.keys() == theirs.keys(), where
+        for key in mine:
+            assert_same(mine[key], theirs[key], f"{where}/{key}")
+    elif isinstance(mine, list | tuple):
+        assert len(mine) == len(theirs), where
+        for k, (one, other) in enumerate(zip(mine, theirs, strict=True)):
+            assert_same(one, other, f"{where}/{k}")
+    elif isinstance(mine, torch.Tensor | np.ndarray):
+        assert type(mine) is type(theirs), where
+        assert mine.dtype == theirs.dtype, where
+        equal = torch.equal if isinstance(mine, torch.Tensor) else np.array_equal
+        assert equal(mine, theirs), where
+    else:
+        assert str(mine) == str(theirs), where
+
+
+def test_runs_that_differ_in_one_element_are_not_the_same():
+    for zeros in (np.zeros(5000, np.float32), torch.zeros(5000)):
+        changed = zeros + 0
+        assert_same({"a": [zeros]}, {"a": [changed]})
+        changed[2500] = 1
+        for other in (changed, zeros[:-1], zeros.astype(float) if isinstance(zeros, np.ndarray) else zeros.double()):
+            with pytest.raises(AssertionError, match="/a/0"):
+                assert_same({"a": [zeros]}, {"a": [other]})
+
+
+# --- The folder -----------------------------------------------------------------------------------------------------
+
+
+def test_a_run_folder_holds_everything_about_the_run(tmp_path: Path):
+    folder = train(request(tmp_path / "a" / "run", tensorboard=True), evaluate=falling, make_envs=toy_envs)
+    assert folder == tmp_path / "a" / "run"
+    present = {path.name for path in folder.iterdir()} - {".lock"}
+    assert present == {
+        "config.json",
+        "metrics.csv",
+        "tensorboard",
+        "checkpoint.pt",
+        "best.pt",
+        "energy.json",
+        "log.txt",
+    }
+    config = json.loads((folder / "config.json").read_text())
+    assert config["identity"]["task"] == "rl2grid/bus14-T0-v0"
+    assert config["identity"]["engine"] == "native"
+    assert {"grid_hash", "scenario_pack_hash", "action_set_hash", "seed", "versions"} <= config["identity"].keys()
+    assert config["request"]["env_keywords"]["normalize"] == "physical"  # defaults are spelt out
+    assert config["request"]["hyperparameters"]["seed"] == 5
+    assert config["seeds"] == {"algorithm": 5, "first_environment": 20}
+    checkpoint = load_checkpoint(folder / "checkpoint.pt", task="rl2grid/bus14-T0-v0")
+    assert checkpoint["decisions"] == SMALL.total_timesteps
+    assert checkpoint["identity"] == config["identity"]
+    wide = pd.read_csv(folder / "metrics.csv").pivot(index="step", columns="name", values="value")
+    assert wide.index.tolist() == list(range(32, 32 * 12 + 1, 32))
+    assert {"charts/SPS", "charts/survival", "charts/episodic_return", "losses/approx_kl"} <= set(wide.columns)
+    assert "finished at 384 decisions" in (folder / "log.txt").read_text()
+
+
+def test_the_stored_request_is_the_request(tmp_path: Path):
+    folder = train(request(tmp_path / "run"), make_envs=toy_envs)
+    args, _ = read_config(folder)
+    assert args.hyperparameters == SMALL
+    assert args.env_keywords["reward"] == (1.0, 0.5, 0.25)
+    assert args.env_keywords["split"] == "train"
+    assert args.task == "rl2grid/bus14-T0-v0"
+    assert args.folder == folder
+    assert asdict(args)["checkpoint_seconds"] == 0.0
+
+
+def test_the_best_policy_by_validation_survival_is_kept(tmp_path: Path):
+    folder = train(request(tmp_path / "run"), evaluate=falling, make_envs=toy_envs)
+    assert load_agent(folder, "bus14-T0").identity["decisions"] == 96
+    wide = pd.read_csv(folder / "metrics.csv").pivot(index="step", columns="name", values="value")
+    validated = wide["validation/survival"].dropna()
+    assert validated.index.tolist() == [96, 192, 288, 384]
+    assert validated.tolist() == pytest.approx([1.0, 0.904, 0.808, 0.712])
+    assert wide["validation/return"].dropna().tolist() == [2.0] * 4
+
+
+def test_the_best_policy_under_a_constraint_is_the_one_most_often_safe(tmp_path: Path):
+    """Then the one that survives longest, then the latest; without the constraint survival alone decides."""
+    safe = {96: 0.5, 192: 0.75, 288: 0.75, 384: 0.75}
+    survival = {96: 1.0, 192: 0.9, 288: 0.95, 384: 0.9}
+
+    def validate(agent: PolicyAgent) -> Mapping[str, float]:
+        decisions = agent.identity["decisions"]
+        return {"survival": survival[decisions], "safe_completed": safe[decisions]}
+
+    for name, changes, best in (
+        ("id", {"task": "bus14-T0-LSI"}, 288),
+        ("keyword", {"env_keywords": {"constraint": "TLO"}}, 288),
+        ("neither", {}, 96),
+    ):
+        folder = train(request(tmp_path / name, **changes), evaluate=validate, make_envs=toy_envs)
+        assert load_agent(folder).identity["decisions"] == best, name
+    assert load_checkpoint(tmp_path / "id" / "checkpoint.pt")["run"]["best_score"] == (0.75, 0.95)
+    assert "75.00% safe and completed, survival 0.9500, after 288" in (tmp_path / "id" / "log.txt").read_text()
+
+
+def test_limits_are_those_of_the_constraint_or_of_lagrangian_ppo(tmp_path: Path):
+    def limits(algorithm: str, task: str, keyword: str | None = None, **changes: Any) -> dict[str, float]:
+        args = hyperparameters(algorithm, task, **changes)
+        return find_limits(RunArgs(task, args, algorithm, env_keywords={"constraint": keyword}))
+
+    assert limits("ppo", "bus14-R") == {}
+    assert limits("ppo", "bus14-R", "TLO") == {"TLO": 50.0}
+    assert limits("dqn", "bus14-T0-LSI") == {"LSI": 0.0}
+    assert limits("lagrangian-ppo", "bus14-R", "TLO", thresholds=(20.0,)) == {"TLO": 20.0}
+    assert limits("lagrangian-ppo", "bus14-T0", constraints=("LSI", "TLO")) == {"LSI": 0.0, "TLO": 50.0}
+
+
+def test_validation_does_not_disturb_training(tmp_path: Path):
+    def drawing(agent: PolicyAgent) -> Mapping[str, float]:
+        torch.randn(10)
+        agent.seed_episode(1, 1)
+        return {"survival": random.random()}
+
+    with_validation = train(request(tmp_path / "a"), evaluate=drawing, make_envs=toy_envs)
+    without = train(request(tmp_path / "b"), make_envs=toy_envs)
+    assert_same(*(load_checkpoint(folder / "checkpoint.pt")["training"] for folder in (with_validation, without)))
+
+
+def test_redispatching_tasks_are_trained_with_continuous_actions(tmp_path: Path):
+    args = hyperparameters("ppo", "bus14-R", **_sizes(SMALL))
+    folder = train(request(tmp_path / "run", task="bus14-R", hyperparameters=args), make_envs=toy_envs)
+    assert "log_std" in load_checkpoint(folder / "checkpoint.pt")["policy"]["network"]
+
+
+def test_the_default_folder_names_task_algorithm_and_seed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    args = replace(request(tmp_path), folder=None)
+    assert train(args, make_envs=toy_envs) == Path("runs/bus14-T0-v0-ppo-5")
+    assert (tmp_path / "runs" / "bus14-T0-v0-ppo-5" / "checkpoint.pt").exists()
+
+
+def _sizes(args: Args) -> dict[str, Any]:
+    return {name: getattr(args, name) for name in ("total_timesteps", "num_envs", "num_steps", "gamma")}
+
+
+# --- Requests that cannot be met ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"task": "bus15-T0"}, "does not exist"),
+        ({"algorithm": "td4"}, "choose one of ppo"),
+        ({"env_keywords": {"heuristics": "idle"}}, "Environment keyword 'heuristics' does not exist"),
+        ({"env_keywords": {"heuristic": "lazy"}}, "lazy"),
+        ({"env_keywords": {"gamma": 0.9}}, "gamma belongs to"),
+        ({"env_keywords": {"split": "test"}}, "Training on the test scenarios"),
+        ({"env_keywords": {"reward": lambda state, i: 0.0}}, "stores its reward by name"),
+        ({"env_keywords": {"scenario": "nowhere"}}, "Scenario 'nowhere' is not in the split train"),
+        ({"evaluate_every": 0}, "evaluate_every"),
+        ({"task": "bus14-R"}, "Only discrete actions can be masked"),
+        ({"task": "bus14-T0-LSI", "env_keywords": {"constraint": "TLO"}}, "contradicts task 'rl2grid/bus14-T0-LSI-v0'"),
+        ({"algorithm": "lagrangian-ppo", "hyperparameters": hyperparameters("lagrangian-ppo", "bus14-T0")}, "needs a"),
+        ({"algorithm": "lagrangian-ppo", "hyperparameters": MISSPELT}, "'LIS' does not exist: choose one of LSI, TLO"),
+    ],
+)
+def test_requests_that_cannot_be_met_leave_nothing_behind(tmp_path: Path, changes: dict[str, Any], sentence: str):
+    with pytest.raises(UsageError, match=sentence):
+        train(request(tmp_path / "run", **changes), make_envs=toy_envs)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_algorithm_that_cannot_learn_the_task_is_refused(monkeypatch: pytest.MonkeyPatch):
+    continuous_only = replace(runs.ALGORITHMS["ppo"], kinds=("R",))
+    monkeypatch.setitem(runs.ALGORITHMS, "td3", continuous_only)
+    with pytest.raises(UsageError, match=r"'td3' cannot learn .*, which has discrete actions: choose one of ppo"):
+        hyperparameters("td3", "bus14-T0")
+
+
+def test_unknown_presets_and_hyperparameters_are_refused():
+    with pytest.raises(UsageError, match="choose one of default, paper"):
+        hyperparameters("ppo", "bus14-T0", "papers")
+    with pytest.raises(UsageError, match="'learning_rate' does not exist: choose one of seed, "):
+        hyperparameters("ppo", "bus14-T0", learning_rate=1.0)
+    assert hyperparameters("ppo", "bus14-R", "paper").actor_learning_rate == 3e-5
+    assert hyperparameters("ppo", "bus14-T0", "paper", seed=8).seed == 8
+
+
+def test_a_folder_that_exists_is_not_written(tmp_path: Path):
+    folder = train(request(tmp_path / "run"), make_envs=toy_envs)
+    before = (folder / "checkpoint.pt").read_bytes()
+    with pytest.raises(UsageError, match="exists already"):
+        train(request(tmp_path / "run"), make_envs=toy_envs)
+    assert (folder / "checkpoint.pt").read_bytes() == before
+
+
+def test_a_folder_without_a_run_is_not_resumed(tmp_path: Path):
+    with pytest.raises(UsageError, match=r"no config\.json"):
+        resume(tmp_path, make_envs=toy_envs)
+    (tmp_path / "config.json").write_text("{")
+    with pytest.raises(UsageError, match="does not describe a run"):
+        resume(tmp_path, make_envs=toy_envs)
+
+
+def test_a_run_is_not_resumed_with_other_data(tmp_path: Path):
+    folder = train(request(tmp_path / "run"), make_envs=toy_envs)
+    config = json.loads((folder / "config.json").read_text())
+    config["identity"]["action_set_hash"] = "0123"
+    (folder / "config.json").write_text(json.dumps(config))
+    with pytest.raises(UsageError, match="action_set_hash was 0123"):
+        resume(folder, make_envs=toy_envs)
+
+
+def test_a_checkpoint_of_another_version_is_not_resumed(tmp_path: Path):
+    folder = train(request(tmp_path / "run"), make_envs=toy_envs)
+    contents = load_checkpoint(folder / "checkpoint.pt")
+    del contents["run"]["best_score"]
+    save_checkpoint(folder / "checkpoint.pt", contents)
+    with pytest.raises(UsageError, match="lacks 'best_score', because another version of rl2grid wrote it"):
+        resume(folder, make_envs=toy_envs)
+
+
+def test_a_run_has_one_writer(tmp_path: Path):
+    def second_writer(args: RunArgs) -> Any:
+        raise AssertionError("got past the lock")
+
+    def evaluate(agent: PolicyAgent) -> Mapping[str, float]:
+        script = (
+            "import sys\nfrom pathlib import Path\n"
+            "from rl2grid.errors import UsageError\nfrom rl2grid.training.runs import resume\n"
+            "try:\n    resume(Path(sys.argv[1]))\nexcept UsageError as error:\n    sys.exit(str(error))\n"
+        )
+        process = subprocess.run(
+            [sys.executable, "-c", script, str(tmp_path / "run")], env=environment(), capture_output=True, text=True
+        )
+        assert process.returncode == 1
+        assert "is being written by another process" in process.stderr
+        return {"survival": 0.0}
+
+    train(request(tmp_path / "run", evaluate_every=10_000), evaluate=evaluate, make_envs=toy_envs)
+
+
+# --- Interruptions --------------------------------------------------------------------------------------------------
+
+
+def test_an_interrupt_ends_the_run_after_the_iteration_and_it_can_be_resumed(tmp_path: Path):
+    straight = train(request(tmp_path / "straight"), evaluate=falling, make_envs=toy_envs)
+
+    class Interrupting(ToyGrid):
+        steps = 0
+
+        def step(self, actions: Any) -> Any:
+            self.steps += 1
+            if self.steps == 35:  # in the middle of the fifth iteration
+                signal.raise_signal(signal.SIGINT)
+            return super().step(actions)
+
+    handler = signal.getsignal(signal.SIGINT)
+    folder = train(
+        request(tmp_path / "run", checkpoint_seconds=1e9),
+        evaluate=falling,
+        make_envs=lambda args: Interrupting(4, gamma=0.9),
+    )
+    assert signal.getsignal(signal.SIGINT) is handler
+    assert load_checkpoint(folder / "checkpoint.pt")["decisions"] == 5 * 32
+    assert "stopped at 160 decisions" in (folder / "log.txt").read_text()
+    assert not is_finished(folder)
+    resume(folder, evaluate=falling, make_envs=toy_envs)
+    assert is_finished(folder)
+    assert_same_run(folder, straight)
+
+
+@pytest.fixture
+def interruptible():
+    """A process in the background of a shell begins with interrupts ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
+def test_a_second_interrupt_ends_the_run_at_once(tmp_path: Path):
+    class Interrupting(ToyGrid):
+        def step(self, actions: Any) -> Any:
+            signal.raise_signal(signal.SIGINT)
+            return super().step(actions)
+
+    with pytest.raises(KeyboardInterrupt):
+        train(request(tmp_path / "run"), make_envs=lambda args: Interrupting(4, gamma=0.9))
+    assert not (tmp_path / "run" / "checkpoint.pt").exists()
+    assert not is_finished(tmp_path / "run")
+
+
+def test_a_finished_run_stays_as_it_is(tmp_path: Path):
+    folder = train(request(tmp_path / "run"), evaluate=falling, make_envs=toy_envs)
+    before = {name: (folder / name).read_bytes() for name in ("checkpoint.pt", "best.pt", "metrics.csv")}
+    resume(folder, evaluate=falling, make_envs=toy_envs)
+    assert {name: (folder / name).read_bytes() for name in before} == before
+
+
+RUNNER = '''
+import os, sys
+from pathlib import Path
+import torch
+from test_runs import falling, request, toy_envs
+from rl2grid.algorithms import checkpoint, metrics
+from rl2grid.training import runs
+
+folder, kill = Path(sys.argv[1]), sys.argv[2]
+place, _, count = kill.partition(":")
+calls = 0
+
+def at(place_now):
+    """Die like a killed process at the given call."""
+    global calls
+    if place_now == place:
+        calls += 1
+        if calls == int(count):
+            os._exit(9)
+
+def save(value, file, original=torch.save):
+    at("before-write")
+    original(value, file)
+    if place == "mid-write" and calls + 1 == int(count):
+        file.truncate(file.tell() // 2)
+        file.flush()
+    at("mid-write")
+
+def replace(source, target, original=os.replace):
+    at("before-replace")
+    original(source, target)
+    at("after-replace")
+
+class Csv:
+    """Dies having written half of a row."""
+    def __init__(self, file): self.file = file
+    def write(self, text):
+        if place == "mid-row" and calls + 1 == int(count):
+            self.file.write(text[: len(text) // 2])
+            self.file.flush()
+        at("mid-row")
+        return self.file.write(text)
+    def flush(self): self.file.flush()
+    def close(self): self.file.close()
+
+def writer(self, *arguments, original=metrics.MetricsWriter.__init__, **keywords):
+    original(self, *arguments, **keywords)
+    self._file = Csv(self._file)
+    self._csv = metrics.csv.writer(self._file, lineterminator="\\n")
+
+torch.save = save
+checkpoint.os.replace = replace
+metrics.MetricsWriter.__init__ = writer
+# Iterations as long as those of a small task, for the kills from outside.
+iterate = runs.ALGORITHMS["ppo"].trainer.iterate
+def slow(self):
+    import time
+    time.sleep(0.02)
+    return iterate(self)
+runs.ALGORITHMS["ppo"].trainer.iterate = slow
+print("ready", flush=True)
+if folder.exists():
+    runs.resume(folder, evaluate=falling, make_envs=toy_envs)
+else:
+    runs.train(request(folder), evaluate=falling, make_envs=toy_envs)
+'''
+
+
+def environment() -> dict[str, str]:
+    paths = [Path(rl2grid.__file__).parents[1], Path(__file__).parent, Path(__file__).parents[1]]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, paths))}
+
+
+def run_until_killed(folder: Path, kill: str, *, after_seconds: float | None = None) -> int:
+    """Train or resume in a process of its own; returns its exit status."""
+    with subprocess.Popen(
+        [sys.executable, "-c", RUNNER, str(folder), kill], env=environment(), stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        if after_seconds is not None:
+            time.sleep(after_seconds)
+            process.kill()
+        return process.wait()
+
+
+@pytest.mark.parametrize(
+    "kills",
+    [
+        ["before-write:1", "mid-write:3", "after-replace:2"],
+        ["mid-row:40", "before-replace:4"],
+    ],
+    ids=["writing", "recording"],
+)
+def test_a_run_killed_at_the_worst_moments_ends_like_one_that_was_not(tmp_path: Path, kills: list[str]):
+    straight = train(request(tmp_path / "straight"), evaluate=falling, make_envs=toy_envs)
+    for kill in kills:
+        assert run_until_killed(tmp_path / "run", kill) == 9
+    resume(tmp_path / "run", evaluate=falling, make_envs=toy_envs)
+    assert_same_run(tmp_path / "run", straight)
+
+
+def test_a_run_killed_at_random_moments_ends_like_one_that_was_not(tmp_path: Path):
+    straight = train(request(tmp_path / "straight"), evaluate=falling, make_envs=toy_envs)
+    for attempt in range(2):
+        seconds = random.uniform(0.0, 0.35)
+        status = run_until_killed(tmp_path / "run", "never:1", after_seconds=seconds)
+        print(f"attempt {attempt}: killed after {seconds:.3f} s, exit status {status}")
+    if not (tmp_path / "run").exists():
+        train(request(tmp_path / "run"), evaluate=falling, make_envs=toy_envs)
+    else:
+        resume(tmp_path / "run", evaluate=falling, make_envs=toy_envs)
+    assert_same_run(tmp_path / "run", straight)
+
+
+@pytest.mark.parametrize(
+    ("task", "engine", "sizes"),
+    [
+        ("bus14-T0", "native", {"num_envs": 20, "num_steps": 8}),
+        ("bus14-R", "native", {"num_envs": 20, "num_steps": 8}),
+        ("bus14-T0", "reference", {"num_envs": 2, "num_steps": 2}),
+    ],
+)
+def test_a_run_on_the_grid_broken_off_and_resumed_ends_like_one_that_was_not(
+    tmp_path: Path, task: str, engine: str, sizes: dict[str, int]
+):
+    iteration = sizes["num_envs"] * sizes["num_steps"]
+
+    class BrokenOffError(Exception):
+        pass
+
+    def break_off(agent: PolicyAgent) -> Mapping[str, float]:
+        if agent.identity["decisions"] == 3 * iteration:  # after two saved iterations, in the middle of the third
+            raise BrokenOffError
+        return {"survival": 0.0}
+
+    def validate(agent: PolicyAgent) -> Mapping[str, float]:
+        return {"survival": 0.0}
+
+    sizes = {**sizes, "total_timesteps": 4 * iteration, "update_epochs": 2}
+    changes = {
+        "task": task,
+        "hyperparameters": hyperparameters("ppo", task, seed=1, **sizes),
+        "env_keywords": {"engine": engine, "heuristic": "idle"},
+        "num_workers": 0 if engine == "reference" else None,
+        "evaluate_every": iteration,
+    }
+    straight = train(request(tmp_path / "straight", **changes), evaluate=validate)
+    with pytest.raises(BrokenOffError):
+        train(request(tmp_path / "run", **changes), evaluate=break_off)
+    assert load_checkpoint(tmp_path / "run" / "checkpoint.pt")["decisions"] == 2 * iteration
+    resume(tmp_path / "run", evaluate=validate)
+    assert_same_run(tmp_path / "run", straight)
+    assert load_checkpoint(straight / "checkpoint.pt")["training"]["grid_steps"] > 4 * iteration
