@@ -22,7 +22,7 @@ from rl2grid.algorithms.policy_agent import load_agent
 from rl2grid.envs.tasks import find_task, short_id
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.protocol import AS_TRAINED, evaluate
-from rl2grid.records.evaluations import EvaluationResult, identity_hash
+from rl2grid.records.evaluations import Evaluation, identity_hash
 from rl2grid.records.files import write_json
 from rl2grid.records.statistics import Estimate
 from rl2grid.records.trainings import read_training_run, read_validations
@@ -116,12 +116,12 @@ def test(chosen: Subject) -> dict[str, Any]:
     }
 
 
-def _rows(result: EvaluationResult) -> list[list[Any]]:
+def _rows(result: Evaluation) -> list[list[Any]]:
     """What must be equal wherever the episodes are played."""
     return [[row.scenario, row.seed, row.grid_steps, row.decisions, row.episode_return] for row in result.episodes]
 
 
-def _figures(result: EvaluationResult) -> dict[str, Any]:
+def _figures(result: Evaluation) -> dict[str, Any]:
     summary = result.summary
     names = ("survival", "completed", "cost_lsi", "cost_tlo", "safe_lsi", "safe_tlo", "decisions")
     return {"episodes": summary.episodes, **{name: _interval(getattr(summary, name)) for name in names}}

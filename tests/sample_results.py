@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from rl2grid.records.episodes import Episode
-from rl2grid.records.evaluations import EvaluationResult
+from rl2grid.records.evaluations import Evaluation
 from rl2grid.records.recordings import Recording
 from rl2grid.records.trainings import Metric, TrainingCurve
 
@@ -56,7 +56,7 @@ def episode(scenario: str = "may", seed: int = 0, survival: float = 1.0, **chang
 
 def result(
     agent: str, survivals: list[list[float]], heuristic: str | None = None, agent_hash: str = "", **identity: Any
-) -> EvaluationResult:
+) -> Evaluation:
     """Survivals by scenario, then seed."""
     words = {"task": TASK, "agent": agent, "heuristic": heuristic, "split": "validation", "versions": {"rl2grid": "0"}}
     words |= identity
@@ -66,7 +66,7 @@ def result(
         for k, row in enumerate(survivals)
         for seed, survival in enumerate(row)
     )
-    return EvaluationResult(episodes, words, f"rl2grid evaluate {agent}")
+    return Evaluation(episodes, words, f"rl2grid evaluate {agent}")
 
 
 def curve(label: str = "ppo", seed: int = 0, n: int = 30) -> TrainingCurve:

@@ -9,7 +9,7 @@ from sample_results import episode, result
 
 from rl2grid.analysis.explorer import explorer_data, explorer_html
 from rl2grid.mdp.termination import GAME_OVER_TEXT, GameOver
-from rl2grid.records.evaluations import EvaluationResult
+from rl2grid.records.evaluations import Evaluation
 
 
 def column(data, name):
@@ -38,7 +38,7 @@ def test_every_episode_is_a_row_of_every_column():
 def test_columns_with_one_value_alone_are_left_out_where_they_often_are():
     names = [one["name"] for one in explorer_data(RESULTS, ["e1", "e2"])["columns"]]
     assert "split" not in names
-    other = EvaluationResult((episode(split="test"),), {"task": "a task"}, "a command")
+    other = Evaluation((episode(split="test"),), {"task": "a task"}, "a command")
     assert "split" in [one["name"] for one in explorer_data([*RESULTS, other], ["e1", "e2", "e3"])["columns"]]
 
 

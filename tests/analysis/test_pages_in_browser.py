@@ -13,7 +13,7 @@ from test_watching import made_up
 from rl2grid.analysis.results_page import write_results_page
 from rl2grid.analysis.watch_page import write_watch_page
 from rl2grid.grids import load_grid
-from rl2grid.records.sources import Sources
+from rl2grid.records.collection import Collection
 from rl2grid.records.trainings import TrainingRun
 
 pytestmark = pytest.mark.slow
@@ -34,7 +34,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("page") / "report.html"
     command = "rl2grid report " + " ".join(f"a-folder-{k}" for k in range(20))
     write_results_page(
-        path, Sources(results, [run]), title="Some results", command=command, train_commands={run.folder: "train"}
+        path, Collection(results, [run]), title="Some results", command=command, train_commands={run.folder: "train"}
     )
     return path
 

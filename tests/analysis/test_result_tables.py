@@ -18,7 +18,7 @@ from rl2grid.analysis.result_tables import (
     score_table,
     survival_table,
 )
-from rl2grid.analysis.tables import (
+from rl2grid.analysis.table import (
     MISSING,
     Cell,
     Column,

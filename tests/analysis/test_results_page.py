@@ -13,7 +13,7 @@ from test_report import Page
 from rl2grid.analysis import results_page, section
 from rl2grid.analysis.results_page import write_results_page
 from rl2grid.errors import UsageError
-from rl2grid.records.sources import Sources
+from rl2grid.records.collection import Collection
 from rl2grid.records.trainings import TrainingRun
 
 RUN = TrainingRun(Path("runs/one"), TASK, {}, 1, curve())
@@ -33,13 +33,13 @@ def _few_figures(monkeypatch):
     )
 
 
-def write(folder: Path, sources: Sources, **changes) -> str:
+def write(folder: Path, collection: Collection, **changes) -> str:
     keywords = {
         "title": "A <b>title</b>",
         "command": "rl2grid report x",
         "train_commands": {RUN.folder: "rl2grid train"},
     }
-    size = write_results_page(folder / "report.html", sources, **{**keywords, **changes})
+    size = write_results_page(folder / "report.html", collection, **{**keywords, **changes})
     text = (folder / "report.html").read_text(encoding="utf-8")
     assert size == len(text.encode())
     assert [path.name for path in folder.iterdir()] == ["report.html"]
@@ -48,15 +48,15 @@ def write(folder: Path, sources: Sources, **changes) -> str:
 
 def test_the_page_is_whole_and_needs_nothing_else(tmp_path):
     told: list[str] = []
-    text = write(tmp_path, Sources(RESULTS, [RUN], ["Something is not there."]), on_figure=told.append)
+    text = write(tmp_path, Collection(RESULTS, [RUN], ["Something is not there."]), on_figure=told.append)
     parser = Page()
     parser.VOID = (*Page.VOID, "input")
     parser.feed(text)
     assert parser.open == []
     assert len(told) == len(section.plan_section(RESULTS, [RUN]).pictures) > 1
-    sources = [address for address in parser.fetched if not address.startswith("#")]
-    assert len(sources) == 2 * len(told)
-    assert all(address.startswith("data:image/png;base64,") for address in sources)
+    addresses = [address for address in parser.fetched if not address.startswith("#")]
+    assert len(addresses) == 2 * len(told)
+    assert all(address.startswith("data:image/png;base64,") for address in addresses)
     assert "http" not in re.sub(r"base64,[^']*", "", text)
     places = {address[1:] for address in parser.fetched if address.startswith("#")}
     assert places <= set(re.findall(r"id='?([\w.-]+)", text))
@@ -74,7 +74,7 @@ def test_the_page_is_whole_and_needs_nothing_else(tmp_path):
 
 
 def test_the_ranking_leads_from_methods_to_their_commands(tmp_path):
-    text = write(tmp_path, Sources(RESULTS))
+    text = write(tmp_path, Collection(RESULTS))
     ranking = text[text.index("id=ranking") : text.index("id=tables")]
     first, second = re.findall(r"<tbody>(.*)</tbody>", ranking)[0].split("</tr>")[:2]
     assert "ppo + idle" in first
@@ -83,34 +83,34 @@ def test_the_ranking_leads_from_methods_to_their_commands(tmp_path):
 
 
 def test_runs_alone_make_a_page(tmp_path):
-    text = write(tmp_path, Sources(runs=[RUN]))
+    text = write(tmp_path, Collection(runs=[RUN]))
     assert "id=ranking" not in text
     assert "id=episodes" not in text
     assert "rl2grid train" in text
 
 
 def test_many_figures_are_folded_by_task(tmp_path, monkeypatch):
-    sources = Sources(RESULTS, [RUN])
+    collection = Collection(RESULTS, [RUN])
     number = len(section.plan_section(RESULTS, [RUN]).pictures)
-    assert "<summary>bus14-T0: " not in write(tmp_path, sources)
+    assert "<summary>bus14-T0: " not in write(tmp_path, collection)
     monkeypatch.setattr(results_page, "UNFOLDED", number - 1)
-    text = write(tmp_path, sources)
+    text = write(tmp_path, collection)
     assert f"<summary>bus14-T0: {number} figures</summary>" in text
     assert text.count("<figure>") == number
 
 
 def test_figures_shrink_until_the_page_fits(tmp_path):
-    sources = Sources(runs=[RUN])
-    limit = len(write(tmp_path, sources).encode()) // 2
-    assert len(write(tmp_path, sources, max_bytes=limit).encode()) <= limit
+    collection = Collection(runs=[RUN])
+    limit = len(write(tmp_path, collection).encode()) // 2
+    assert len(write(tmp_path, collection, max_bytes=limit).encode()) <= limit
     # A limit that cannot be kept is no reason to lose the figures.
-    pictures = section.plan_section(sources.results, sources.runs).pictures
-    assert write(tmp_path, sources, max_bytes=1).count("<figure>") == len(pictures)
+    pictures = section.plan_section(collection.evaluations, collection.runs).pictures
+    assert write(tmp_path, collection, max_bytes=1).count("<figure>") == len(pictures)
 
 
 def test_results_that_do_not_belong_together_make_no_page(tmp_path):
     with pytest.raises(UsageError, match="different engine"):
-        write(tmp_path, Sources([RESULTS[0], result("other", [[1.0], [1.0], [1.0]], engine="another")]))
+        write(tmp_path, Collection([RESULTS[0], result("other", [[1.0], [1.0], [1.0]], engine="another")]))
     with pytest.raises(UsageError, match="nothing to analyse"):
-        write(tmp_path, Sources())
+        write(tmp_path, Collection())
     assert not list(tmp_path.iterdir())

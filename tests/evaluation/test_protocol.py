@@ -26,12 +26,12 @@ from rl2grid.engines import ENGINES
 from rl2grid.envs.registration import register_all
 from rl2grid.errors import UsageError
 from rl2grid.evaluation import protocol as evaluation
+from rl2grid.evaluation.crew import Job, Setting, make_crew
 from rl2grid.evaluation.episode import environment_seed, play_episode
-from rl2grid.evaluation.players import Job, Setting, players
 from rl2grid.evaluation.protocol import PARTIAL_FILE, evaluate, run_evaluation
 from rl2grid.grids import GRID_IDS
 from rl2grid.records.episodes import EPISODES_FILE, Episode, read_episodes
-from rl2grid.records.evaluations import EVALUATION_FILE, EvaluationResult, load_evaluation
+from rl2grid.records.evaluations import EVALUATION_FILE, Evaluation, load_evaluation
 from rl2grid.scenarios.generated import VERSION
 from rl2grid.scenarios.library import list_scenarios
 from rl2grid.training.runs import hyperparameters
@@ -58,7 +58,7 @@ def _workers_find_the_fake_grid(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, paths)))
 
 
-def play(agent=None, jobs=JOBS, *, workers=0, output=None, identity=IDENTITY, **keywords) -> EvaluationResult:
+def play(agent=None, jobs=JOBS, *, workers=0, output=None, identity=IDENTITY, **keywords) -> Evaluation:
     keywords.setdefault("heuristic", "idle")
     return run_evaluation(
         Setting(FAKE, agent or RandomAgent(), keywords),
@@ -397,9 +397,9 @@ def test_the_policy_played_is_the_one_whose_hash_is_stored(checkpoint, tmp_path,
 
     def replaced(*arguments):
         path.write_bytes(b"another policy")
-        return players(*arguments)
+        return make_crew(*arguments)
 
-    monkeypatch.setattr(evaluation, "players", replaced)
+    monkeypatch.setattr(evaluation, "make_crew", replaced)
     options = {"scenarios": list_scenarios("bus14", "validation")[:1], "name": "mine"}
     result = evaluate(path, "bus14-T0", workers=workers, **options)
     monkeypatch.undo()

@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 from sample_results import episode, result
 
-from rl2grid.analysis.tables import HEADINGS, markdown_table, rich_table
+from rl2grid.analysis.summary_table import HEADINGS, markdown_table, rich_table
 from rl2grid.errors import UsageError
 from rl2grid.records.episodes import COLUMNS, read_episodes, write_episodes
 from rl2grid.records.evaluations import check_comparable, load_evaluation

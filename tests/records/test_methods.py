@@ -9,7 +9,7 @@ import pytest
 from sample_results import TASK, result
 
 from rl2grid.errors import UsageError
-from rl2grid.records.evaluations import EvaluationResult
+from rl2grid.records.evaluations import Evaluation
 from rl2grid.records.methods import group_methods, resampled_units
 from rl2grid.records.statistics import Unit
 from rl2grid.records.trainings import group_curves, read_training_run
@@ -39,7 +39,7 @@ def test_dying_early_is_cheap_but_not_safe():
     assert method.within("LSI").values.mean() == 0.5
 
 
-def trained(seeds: tuple[int, int] = (1, 2), algorithms: tuple[str, str] = ("ppo", "ppo")) -> list[EvaluationResult]:
+def trained(seeds: tuple[int, int] = (1, 2), algorithms: tuple[str, str] = ("ppo", "ppo")) -> list[Evaluation]:
     return [
         result("a", [[0.5]], agent_hash=f"{k}", agent_identity={"algorithm": name, "trained_with": {"seed": seed}})
         for k, (seed, name) in enumerate(zip(seeds, algorithms, strict=True))

@@ -11,7 +11,7 @@ from typing import Any
 from rl2grid.envs.tasks import short_id
 from rl2grid.mdp.termination import GAME_OVER_TEXT, GameOver
 from rl2grid.records.episodes import Episode
-from rl2grid.records.evaluations import EvaluationResult
+from rl2grid.records.evaluations import Evaluation
 from rl2grid.records.methods import method_label
 
 DIGITS = 6
@@ -62,7 +62,7 @@ _TRAINING = {"name": "training", "heading": "Training seed"}
 _MADE_BY = {"name": "made", "heading": "Made by"}
 
 
-def explorer_html(results: Sequence[EvaluationResult], made_by: Sequence[str]) -> str:
+def explorer_html(results: Sequence[Evaluation], made_by: Sequence[str]) -> str:
     """A section with all episodes.
 
     Args:
@@ -75,7 +75,7 @@ def explorer_html(results: Sequence[EvaluationResult], made_by: Sequence[str]) -
     return body.replace("{script}", _resource("explorer.js")).replace("{data}", data)
 
 
-def explorer_data(results: Sequence[EvaluationResult], made_by: Sequence[str]) -> dict[str, Any]:
+def explorer_data(results: Sequence[Evaluation], made_by: Sequence[str]) -> dict[str, Any]:
     """What the page embeds, ready for JSON: columns of numbers, and columns of words as places in a list of them."""
     episodes = [episode for result in results for episode in result.episodes]
     values = {column: [column.value(episode) for episode in episodes] for column in _COLUMNS}
@@ -88,7 +88,7 @@ def explorer_data(results: Sequence[EvaluationResult], made_by: Sequence[str]) -
     return {"rows": len(episodes), "columns": [*columns, {**_MADE_BY, **_words(places)}]}
 
 
-def _training_seed(result: EvaluationResult) -> str:
+def _training_seed(result: Evaluation) -> str:
     """Empty for agents without training."""
     agent = result.identity.get("agent_identity") or {}
     return str(agent.get("trained_with", {}).get("seed", ""))

@@ -35,7 +35,7 @@ from rl2grid.drawing.theme import (
     loading_colours,
     style,
 )
-from rl2grid.records.evaluations import EvaluationResult
+from rl2grid.records.evaluations import Evaluation
 from rl2grid.records.recordings import Recording
 from rl2grid.records.statistics import Floats, bootstrap_band, episode_mean
 from rl2grid.records.trainings import SURVIVAL, Metric, TrainingCurve
@@ -122,7 +122,7 @@ def training_sentence(curves: Sequence[TrainingCurve], measure: str) -> str:
 
 
 def survival_by_agent(
-    results: Sequence[EvaluationResult], *, theme: Theme = LIGHT, title: str = "Survival by agent"
+    results: Sequence[Evaluation], *, theme: Theme = LIGHT, title: str = "Survival by agent"
 ) -> Figure:
     """Every episode as a dot, the mean with its 95% interval, and both in numbers; the best agent on top."""
     ranked = sorted(results, key=lambda result: result.summary.survival.value)
@@ -216,7 +216,7 @@ def _draw_runs(axes: Axes, label: str, runs: Sequence[Metric], x: str, colour: s
     axes.plot(position, average, color=colour, linewidth=2, label=label)
 
 
-def _draw_agent(axes: Axes, row: int, result: EvaluationResult, colour: str, theme: Theme) -> None:
+def _draw_agent(axes: Axes, row: int, result: Evaluation, colour: str, theme: Theme) -> None:
     survival = np.array([episode.survival for episode in result.episodes])
     estimate = result.summary.survival
     axes.plot(
@@ -351,7 +351,7 @@ def _spread(values: Floats) -> Floats:
     return heights
 
 
-def _agent_label(result: EvaluationResult) -> str:
+def _agent_label(result: Evaluation) -> str:
     summary = result.summary
     return summary.agent if summary.heuristic == "none" else f"{summary.agent}\n+ {summary.heuristic}"
 

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from rl2grid.analysis.tables import Cell, ResultTable
+from rl2grid.analysis.table import Cell, ResultTable
 from rl2grid.records.evaluations import identity_hash
 from rl2grid.records.files import write_text
 

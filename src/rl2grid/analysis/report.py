@@ -16,7 +16,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from rl2grid.analysis import figures, tables
+from rl2grid.analysis import figures, summary_table
 from rl2grid.analysis.page import (
     cell_html,
     code_html,
@@ -29,7 +29,7 @@ from rl2grid.analysis.page import (
     write_page,
 )
 from rl2grid.drawing.theme import DARK, LIGHT, Theme
-from rl2grid.records.evaluations import EvaluationResult, check_comparable
+from rl2grid.records.evaluations import Evaluation, check_comparable
 from rl2grid.records.files import make_folder, write_text
 from rl2grid.records.recordings import Recording
 from rl2grid.records.summary import Summary
@@ -50,7 +50,7 @@ class _Picture:
 
 def write_report(
     folder: Path,
-    results: Sequence[EvaluationResult],
+    results: Sequence[Evaluation],
     *,
     title: str,
     introduction: str = "",
@@ -84,10 +84,11 @@ def write_report(
         figures.save_figure(light, folder / FIGURES_FOLDER / picture.name)
         dark = figures.png_bytes(picture.draw(DARK))
         drawn.append(figure_html(picture.caption, figures.png_bytes(light), dark, code_html(picture.command)))
-    write_text(folder / TABLE_FILE, f"# {title}\n\n{tables.markdown_table(summaries)}\n{tables.LEGEND}\n")
+    write_text(folder / TABLE_FILE, f"# {title}\n\n{summary_table.markdown_table(summaries)}\n{summary_table.LEGEND}\n")
     body = [
         _header(title, introduction, summaries),
-        f"<section><h2>Results</h2>{_table_html(summaries)}<p class=note>{html.escape(tables.LEGEND)}</p></section>",
+        f"<section><h2>Results</h2>{_table_html(summaries)}"
+        f"<p class=note>{html.escape(summary_table.LEGEND)}</p></section>",
         *drawn,
         _endings_html(summaries),
         _commands_html(results, commands),
@@ -98,7 +99,7 @@ def write_report(
 
 
 def _pictures(
-    results: Sequence[EvaluationResult],
+    results: Sequence[Evaluation],
     curves: Sequence[TrainingCurve],
     recordings: Sequence[Recording],
     commands: Mapping[str, str],
@@ -147,11 +148,11 @@ def _header(title: str, introduction: str, summaries: Sequence[Summary]) -> str:
 
 
 def _table_html(summaries: Sequence[Summary]) -> str:
-    head = "".join(f"<th>{html.escape(heading)}</th>" for heading in tables.HEADINGS)
+    head = "".join(f"<th>{html.escape(heading)}</th>" for heading in summary_table.HEADINGS)
     rows = []
     for summary in summaries:
-        cells = "".join(f"<td>{cell_html(cell)}</td>" for cell in tables.table_cells(summary))
-        rows.append(f"<tr{' class=best' if tables.is_best(summary, summaries) else ''}>{cells}</tr>")
+        cells = "".join(f"<td>{cell_html(cell)}</td>" for cell in summary_table.table_cells(summary))
+        rows.append(f"<tr{' class=best' if summary_table.is_best(summary, summaries) else ''}>{cells}</tr>")
     return scrolling(head, "".join(rows))
 
 
@@ -172,7 +173,7 @@ def _endings_html(summaries: Sequence[Summary]) -> str:
     return f"<section><h2>How episodes ended</h2>{table_html(headings, rows)}</section>"
 
 
-def _commands_html(results: Sequence[EvaluationResult], commands: Mapping[str, str]) -> str:
+def _commands_html(results: Sequence[Evaluation], commands: Mapping[str, str]) -> str:
     made = [(f"results of {html.escape(result.summary.agent)}", result.command) for result in results]
     made += [(html.escape(purpose), command) for purpose, command in commands.items()]
     return f"<section><h2>What made every number</h2>{commands_html(made)}</section>"

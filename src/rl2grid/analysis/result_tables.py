@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 
 from rl2grid.analysis.lifetimes import kaplan_meier, lifetimes, log_rank
-from rl2grid.analysis.tables import MISSING, Cell, Column, ResultTable, interval_cell, mean_cell, share_cell
+from rl2grid.analysis.table import MISSING, Cell, Column, ResultTable, interval_cell, mean_cell, share_cell
 from rl2grid.envs.tasks import short_id
 from rl2grid.mdp.constraints import THRESHOLDS
 from rl2grid.mdp.termination import GAME_OVER_TEXT, GameOver

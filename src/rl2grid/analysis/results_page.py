@@ -28,9 +28,9 @@ from rl2grid.analysis.result_tables import Methods, ranking, ranking_table
 from rl2grid.analysis.section import Picture, Section, plan_section
 from rl2grid.drawing.theme import DARK, LIGHT
 from rl2grid.envs.tasks import short_id
-from rl2grid.records.evaluations import EvaluationResult
+from rl2grid.records.collection import Collection
+from rl2grid.records.evaluations import Evaluation
 from rl2grid.records.methods import Method, method_label
-from rl2grid.records.sources import Sources
 from rl2grid.records.trainings import TrainingRun
 
 MAX_BYTES = 20_000_000
@@ -52,7 +52,7 @@ class _Drawn:
 
 def write_results_page(
     path: Path,
-    sources: Sources,
+    collection: Collection,
     *,
     title: str,
     command: str,
@@ -65,25 +65,27 @@ def write_results_page(
 
     Args:
         path: of the page, in a folder that exists.
-        sources: evaluations and runs.
+        collection: evaluations and runs.
         title: headline.
         command: what was typed to obtain the page.
         train_commands: what was typed to obtain each run, by its folder.
         on_figure: told the name of every figure before it is drawn.
         max_bytes: what the page may have; the resolution of the figures is lowered until it fits, within reason.
-        plan: of these sources, where :func:`plan_section` made it already; None: it is made.
+        plan: of this collection, where :func:`plan_section` made it already; None: it is made.
 
     Raises:
         UsageError: nothing is given, or results or runs that do not belong together; nothing was written.
     """
-    section = plan or plan_section(sources.results, sources.runs)
+    section = plan or plan_section(collection.evaluations, collection.runs)
     drawn = [_draw(picture, on_figure) for picture in section.pictures]
-    before = [_header(title, sources, section.methods)]
-    before += [*_missing(sources.missing), *_rankings(section.methods, sources.results)]
+    before = [_header(title, collection, section.methods)]
+    before += [*_missing(collection.missing), *_rankings(section.methods, collection.evaluations)]
     before += _tables(section)
-    after = [explorer_html(sources.results, _places("e", sources.results))] if sources.results else []
-    after += [_commands(sources, command, train_commands)]
-    after += [identities_html([(_name(result), result.identity) for result in sources.results])]
+    after = (
+        [explorer_html(collection.evaluations, _places("e", collection.evaluations))] if collection.evaluations else []
+    )
+    after += [_commands(collection, command, train_commands)]
+    after += [identities_html([(_name(result), result.identity) for result in collection.evaluations])]
     others = sum(len(part.encode()) for part in (*before, *after))
     fitting = _fitted(drawn, max(max_bytes - others, 0))
     write_page(path, title, [*before, *_figures(fitting), *after])
@@ -116,14 +118,14 @@ def _scaled(png: bytes, scale: float) -> bytes:
     return file.getvalue()
 
 
-def _header(title: str, sources: Sources, methods: Methods) -> str:
-    episodes = sum(len(result.episodes) for result in sources.results)
-    tasks = {*methods, *(run.task for run in sources.runs)}
+def _header(title: str, collection: Collection, methods: Methods) -> str:
+    episodes = sum(len(result.episodes) for result in collection.evaluations)
+    tasks = {*methods, *(run.task for run in collection.runs)}
     labels = {method.label for group in methods.values() for method in group}
     facts = [
         ("tasks", f"{len(tasks)}"),
         ("methods", f"{len(labels)}"),
-        ("training runs", f"{len(sources.runs)}"),
+        ("training runs", f"{len(collection.runs)}"),
         ("episodes", f"{episodes:,}"),
     ]
     places = {"ranking": "Ranking", "tables": "Tables", "figures": "Figures", "episodes": "Episodes"}
@@ -141,7 +143,7 @@ def _missing(sentences: Sequence[str]) -> list[str]:
     return [f"<section><h2>What is missing</h2><ul class=note>{items}</ul></section>"]
 
 
-def _rankings(methods: Methods, results: Sequence[EvaluationResult]) -> list[str]:
+def _rankings(methods: Methods, results: Sequence[Evaluation]) -> list[str]:
     parts = []
     for task, group in methods.items():
         links = [_method_links(method, results) for method in ranking(group)]
@@ -150,8 +152,8 @@ def _rankings(methods: Methods, results: Sequence[EvaluationResult]) -> list[str
     return [f"<section><h2 id=ranking>Ranking</h2>{''.join(parts)}</section>"] if parts else []
 
 
-def _method_links(method: Method, results: Sequence[EvaluationResult]) -> str:
-    ids = {id(result) for result in method.results}
+def _method_links(method: Method, results: Sequence[Evaluation]) -> str:
+    ids = {id(result) for result in method.evaluations}
     return " ".join(_link(f"e{k}") for k, result in enumerate(results, start=1) if id(result) in ids)
 
 
@@ -184,14 +186,16 @@ def _figure(drawn: _Drawn) -> str:
     return figure_html(drawn.picture.caption, drawn.light, drawn.dark, _made_by(drawn.picture.task))
 
 
-def _commands(sources: Sources, command: str, train_commands: Mapping[Path, str]) -> str:
+def _commands(collection: Collection, command: str, train_commands: Mapping[Path, str]) -> str:
     parts = [commands_html([("this page", command)])]
     tasks = dict.fromkeys(
-        [*(result.episodes[0].task for result in sources.results), *(run.task for run in sources.runs)]
+        [*(result.episodes[0].task for result in collection.evaluations), *(run.task for run in collection.runs)]
     )
     for task in tasks:
-        runs = [(f"r{k}", run) for k, run in enumerate(sources.runs, start=1) if run.task == task]
-        results = [(f"e{k}", one) for k, one in enumerate(sources.results, start=1) if one.episodes[0].task == task]
+        runs = [(f"r{k}", run) for k, run in enumerate(collection.runs, start=1) if run.task == task]
+        results = [
+            (f"e{k}", one) for k, one in enumerate(collection.evaluations, start=1) if one.episodes[0].task == task
+        ]
         made = [(_named(place, _run_name(run)), train_commands[run.folder]) for place, run in runs]
         made += [(_named(place, _name(result)), result.command) for place, result in results]
         parts.append(
@@ -212,7 +216,7 @@ def _named(place: str, name: str) -> str:
     return f"<span id={place}>{place}: {html.escape(name)}</span>"
 
 
-def _name(result: EvaluationResult) -> str:
+def _name(result: Evaluation) -> str:
     first = result.episodes[0]
     folder = f", {result.folder}" if result.folder else ""
     return f"{method_label(first)} on {first.task.removeprefix('rl2grid/')}, {len(result.episodes)} episodes{folder}"

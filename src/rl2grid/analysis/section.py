@@ -20,12 +20,12 @@ from rl2grid.analysis import comparison_figures as compare
 from rl2grid.analysis import figures
 from rl2grid.analysis.ending_figures import draw_ending_bars, draw_ending_map
 from rl2grid.analysis.result_tables import Methods, result_tables
-from rl2grid.analysis.tables import WRITERS, ResultTable
+from rl2grid.analysis.table import WRITERS, ResultTable
 from rl2grid.analysis.training_figures import COST_PANELS, SCORE_PANELS, draw_panels, logs
 from rl2grid.drawing.theme import LIGHT, Theme
 from rl2grid.envs.tasks import short_id
 from rl2grid.errors import UsageError
-from rl2grid.records.evaluations import EvaluationResult
+from rl2grid.records.evaluations import Evaluation
 from rl2grid.records.files import make_folder, write_text
 from rl2grid.records.methods import Method, group_methods
 from rl2grid.records.trainings import TrainingCurve, TrainingRun, group_curves
@@ -62,7 +62,7 @@ OnFile = Callable[[str], None]
 """Told the name of every table and figure before it is written."""
 
 
-def plan_section(results: Sequence[EvaluationResult], runs: Sequence[TrainingRun] = ()) -> Section:
+def plan_section(results: Sequence[Evaluation], runs: Sequence[TrainingRun] = ()) -> Section:
     """All tables and figures that apply; nothing is drawn yet.
 
     Raises:
@@ -77,7 +77,7 @@ def plan_section(results: Sequence[EvaluationResult], runs: Sequence[TrainingRun
 
 def results_section(
     folder: Path,
-    results: Sequence[EvaluationResult],
+    results: Sequence[Evaluation],
     runs: Sequence[TrainingRun] = (),
     *,
     command: str = "",
@@ -213,7 +213,7 @@ def _by_grid(methods: Methods) -> dict[str, list[Method]]:
     return {grid: group for grid, group in groups.items() if len({method.task.level for method in group}) > 1}
 
 
-def _index(section: Section, results: Sequence[EvaluationResult], runs: Sequence[TrainingRun], command: str) -> str:
+def _index(section: Section, results: Sequence[Evaluation], runs: Sequence[TrainingRun], command: str) -> str:
     lines = ["# Results", ""]
     if command:
         lines += ["Everything here was made by", "", f"    {command}", ""]

@@ -10,7 +10,7 @@ from typing import Any
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from rl2grid.errors import UsageError
-from rl2grid.records.sources import load_sources
+from rl2grid.records.collection import collect
 from rl2grid.scenarios.splits import SPLITS
 
 THEMES = ("light", "dark")
@@ -33,8 +33,8 @@ def add_parser(commands: Any) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    sources = load_sources(options.folders, options.split)
-    results, runs = sources.results, sources.runs
+    collection = collect(options.folders, options.split)
+    results, runs = collection.evaluations, collection.runs
     try:
         from rl2grid.analysis import section
         from rl2grid.drawing import theme as themes
@@ -53,7 +53,7 @@ def _run(options: argparse.Namespace) -> int:
             on_file=lambda name: bar.update(task, advance=1, description=name),
             plan=plan,
         )
-    for sentence in sources.missing:
+    for sentence in collection.missing:
         print(sentence)
     print(f"{len(plan.tables)} tables and {len(plan.pictures)} figures, listed in {index}.")
     return 0

@@ -27,7 +27,7 @@ from rich.table import Table
 
 from rl2grid.errors import UsageError
 from rl2grid.grids import GRID_IDS, Grid, load_grid
-from rl2grid.scenarios import generated, holdings, published
+from rl2grid.scenarios import generated, inventory, published
 from rl2grid.scenarios.cache import data_folder, remove_damaged
 from rl2grid.scenarios.download import download_dataset, find_archive
 from rl2grid.scenarios.export import export_scenario
@@ -73,10 +73,10 @@ def _list(options: argparse.Namespace) -> int:
     table.add_column("where", overflow="fold")
     for grid in grids:
         _remove_damaged(grid)
-        for holding in holdings.holdings(grid):
-            table.add_row(grid.id, holding.kind, holding.what, decimal(holding.size), str(holding.place))
+        for stored in inventory.inventory(grid):
+            table.add_row(grid.id, stored.kind, stored.what, decimal(stored.size), str(stored.place))
     _console().print(table)
-    print(f"Caches in {data_folder()} take {decimal(holdings.caches_size())}; `rl2grid data clean` removes them.")
+    print(f"Caches in {data_folder()} take {decimal(inventory.caches_size())}; `rl2grid data clean` removes them.")
     return 0
 
 
@@ -164,7 +164,7 @@ def _export(options: argparse.Namespace) -> int:
     scenario = load_scenario(grid.id, options.scenario)
     with _progress(TaskProgressColumn(), _Rate(" values/s", 1.0), TimeRemainingColumn()) as bar:
         folder = export_scenario(grid, scenario, options.folder, _reporting(bar, f"Writing {options.folder}"))
-    print(f"Wrote {scenario.n_rows:,} rows of {scenario.id} to {folder} ({decimal(holdings.size_of(folder))}).")
+    print(f"Wrote {scenario.n_rows:,} rows of {scenario.id} to {folder} ({decimal(inventory.size_of(folder))}).")
     return 0
 
 
@@ -206,7 +206,7 @@ def _add_clean(actions: Any) -> None:
 
 
 def _clean(options: argparse.Namespace) -> int:
-    size = decimal(holdings.caches_size())
+    size = decimal(inventory.caches_size())
     where = f"expanded copies and generated months in {data_folder()}"
     if not options.yes:
         if not sys.stdin.isatty():
@@ -214,7 +214,7 @@ def _clean(options: argparse.Namespace) -> int:
         if input(f"Remove the {where} ({size})? They are made again when needed. [y/N] ").strip().lower() != "y":
             print("Nothing was removed.")
             return 0
-    holdings.remove_caches()
+    inventory.remove_caches()
     print(f"Removed the {where}: {size}.")
     return 0
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from rich.console import Console
 
-from rl2grid.analysis.tables import rich_table
+from rl2grid.analysis.summary_table import rich_table
 from rl2grid.cli import keywords
 from rl2grid.envs.tasks import find_task
 from rl2grid.evaluation.flags import environment_flags, evaluate_command

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from rl2grid.analysis.tables import result_table_rich
+from rl2grid.analysis.table import result_table_rich
 from rl2grid.errors import UsageError
 from rl2grid.records.entries import Entry, read_entry, write_entry
 from rl2grid.records.evaluations import check_comparable
@@ -20,7 +20,7 @@ from rl2grid.records.methods import Method
 from rl2grid.scenarios.splits import SPLITS
 
 if TYPE_CHECKING:
-    from rl2grid.records.evaluations import EvaluationResult
+    from rl2grid.records.evaluations import Evaluation
 
 DIFFERENT = 1
 """Exit status when an entry is not what its actions make."""
@@ -105,7 +105,7 @@ def _verify(options: argparse.Namespace) -> int:
 def _table(options: argparse.Namespace) -> int:
     from rl2grid.analysis.result_tables import entry_table
 
-    by_task: dict[str, dict[Path, EvaluationResult]] = {}
+    by_task: dict[str, dict[Path, Evaluation]] = {}
     for path, entry in _read(options.files).items():
         by_task.setdefault(entry.identity["task"], {})[path] = entry.result
     for results in by_task.values():

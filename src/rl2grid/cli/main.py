@@ -98,7 +98,7 @@ def _add_tasks(commands: argparse._SubParsersAction[_Parser]) -> None:
 
 
 def _tasks(options: argparse.Namespace) -> int:
-    from rl2grid.cli.tables import print_tasks
+    from rl2grid.cli.tasks import print_tasks
 
     print_tasks(options.grid)
     return 0

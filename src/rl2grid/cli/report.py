@@ -13,8 +13,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from rl2grid.cli.analyse import SPLIT_HELP
 from rl2grid.envs.tasks import short_id
 from rl2grid.errors import UsageError
+from rl2grid.records.collection import Collection, collect
 from rl2grid.records.files import make_folder
-from rl2grid.records.sources import Sources, load_sources
 from rl2grid.records.trainings import TrainingRun
 from rl2grid.scenarios.splits import SPLITS
 
@@ -37,30 +37,30 @@ def add_parser(commands: Any) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    sources = load_sources(options.folders, options.split)
+    collection = collect(options.folders, options.split)
     try:
         from rl2grid.analysis import results_page, section
     except ImportError as error:
         raise UsageError(f"Reports need {error.name}: install it with `pip install rl2grid[analysis]`.") from None
-    plan = section.plan_section(sources.results, sources.runs)
+    plan = section.plan_section(collection.evaluations, collection.runs)
     number = len(plan.pictures)
-    train_commands = _train_commands(sources.runs)
+    train_commands = _train_commands(collection.runs)
     make_folder(options.output)
     path = options.output / PAGE_FILE
     with Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), transient=True) as bar:
         task = bar.add_task("Drawing", total=number)
         size = results_page.write_results_page(
             path,
-            sources,
-            title=options.title or _title(sources),
+            collection,
+            title=options.title or _title(collection),
             command=_command(options),
             train_commands=train_commands,
             on_figure=lambda name: bar.update(task, advance=1, description=name),
             plan=plan,
         )
-    for sentence in sources.missing:
+    for sentence in collection.missing:
         print(sentence)
-    print(f"{number} figures, {sum(len(result.episodes) for result in sources.results):,} episodes.")
+    print(f"{number} figures, {sum(len(result.episodes) for result in collection.evaluations):,} episodes.")
     print(f"Written: {path} ({size / 1e6:.1f} MB).")
     return 0
 
@@ -75,10 +75,13 @@ def _train_commands(runs: Sequence[TrainingRun]) -> dict[Path, str]:
     return {run.folder: training_command(run.folder) for run in runs}
 
 
-def _title(sources: Sources) -> str:
+def _title(collection: Collection) -> str:
     tasks = list(
         dict.fromkeys(
-            [*(str(result.identity["task"]) for result in sources.results), *(run.task for run in sources.runs)]
+            [
+                *(str(result.identity["task"]) for result in collection.evaluations),
+                *(run.task for run in collection.runs),
+            ]
         )
     )
     if len(tasks) > 3:

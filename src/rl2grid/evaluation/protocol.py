@@ -31,11 +31,11 @@ from rl2grid.agents.agent import Agent
 from rl2grid.envs.tasks import Task, TaskOptions, constraint_of, find_task
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import make_agent
+from rl2grid.evaluation.crew import Job, Progress, Setting, make_crew
 from rl2grid.evaluation.episode import PlayedEpisode
-from rl2grid.evaluation.players import Job, Progress, Setting, players
 from rl2grid.mdp.actions import action_set_hash
 from rl2grid.records.episodes import EPISODES_FILE, Episode, format_row, read_episodes, write_episodes
-from rl2grid.records.evaluations import EVALUATION_FILE, EvaluationResult, identity_hash, read_request, write_evaluation
+from rl2grid.records.evaluations import EVALUATION_FILE, Evaluation, identity_hash, read_request, write_evaluation
 from rl2grid.records.files import check_folder, make_folder
 from rl2grid.records.summary import Summary, summarise
 from rl2grid.records.versions import library_versions
@@ -63,7 +63,7 @@ def evaluate(
     name: str | None = None,
     command: str | None = None,
     **options: Any,
-) -> EvaluationResult:
+) -> Evaluation:
     """Play every scenario with every seed.
 
     Args:
@@ -126,13 +126,13 @@ def run_evaluation(
     workers: int = 0,
     output: Path | None = None,
     progress: bool = False,
-) -> EvaluationResult:
+) -> Evaluation:
     """Play ``jobs``, those excepted that ``output`` holds already; see :func:`evaluate`.
 
     Args:
         setting: task, agent and keywords of the environments.
         jobs: the episodes, in the order in which they are to be listed.
-        identity: what the result is a result of; see :class:`~rl2grid.records.evaluations.EvaluationResult`.
+        identity: what the result is a result of; see :class:`~rl2grid.records.evaluations.Evaluation`.
         command: what to type to obtain the result again.
         workers: processes; 0: this process plays.
         output: folder; None: nothing is stored.
@@ -145,7 +145,7 @@ def run_evaluation(
         display.skip(done)
         missing = [job for job in jobs if job not in done]
         if missing:
-            with players(setting, workers) as crew:
+            with make_crew(setting, workers) as crew:
                 for played in crew.play(missing, display.advance):
                     episode = _row(played, identity, digest)
                     store.add(episode)
@@ -153,7 +153,7 @@ def run_evaluation(
                     done[_job(episode)] = episode
         episodes = tuple(done[job] for job in jobs)
         store.finish(episodes)
-    return EvaluationResult(episodes, identity, command, output)
+    return Evaluation(episodes, identity, command, output)
 
 
 def env_keywords(agent: Agent, keywords: dict[str, Any]) -> dict[str, Any]:

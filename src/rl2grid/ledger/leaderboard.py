@@ -24,6 +24,7 @@ from rl2grid.evaluation.agents import AGENTS, make_agent
 from rl2grid.evaluation.episode import PlayedEpisode, play_episode
 from rl2grid.evaluation.protocol import question
 from rl2grid.mdp.rewards import resolve_reward
+from rl2grid.records.collection import CELL_FILE, EVALUATION_FOLDER, RUN_FOLDER, find_evaluations
 from rl2grid.records.entries import (
     FACTS,
     Actions,
@@ -34,8 +35,7 @@ from rl2grid.records.entries import (
     facts_of,
 )
 from rl2grid.records.episodes import Episode
-from rl2grid.records.evaluations import EVALUATION_FILE, EvaluationResult, load_evaluation
-from rl2grid.records.sources import CELL_FILE, EVALUATION_FOLDER, RUN_FOLDER, find_evaluations
+from rl2grid.records.evaluations import EVALUATION_FILE, Evaluation, load_evaluation
 from rl2grid.records.trainings import RUN_FILE
 from rl2grid.records.versions import library_versions
 from rl2grid.scenarios.library import check_in_split
@@ -285,7 +285,7 @@ def _run_around(evaluation: Path) -> Path | None:
     return None
 
 
-def _find_agent(result: EvaluationResult, run: Path | None, agent: str | None) -> Agent:
+def _find_agent(result: Evaluation, run: Path | None, agent: str | None) -> Agent:
     identity, task = result.identity, result.identity["task"]
     if agent is not None:
         candidates: list[str | Path] = [agent]

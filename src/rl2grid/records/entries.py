@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from rl2grid.errors import UsageError
 from rl2grid.records.episodes import COLUMNS, Episode
-from rl2grid.records.evaluations import EvaluationResult, identity_hash
+from rl2grid.records.evaluations import Evaluation, identity_hash
 from rl2grid.records.files import write_json
 
 FORMAT, VERSION = "rl2grid leaderboard entry", 1
@@ -62,7 +62,7 @@ class Entry:
     label: str
     """What tables call the agent."""
     identity: Mapping[str, Any]
-    """Of the evaluation; see :class:`~rl2grid.records.evaluations.EvaluationResult`."""
+    """Of the evaluation; see :class:`~rl2grid.records.evaluations.Evaluation`."""
     command: str
     """What made the evaluation."""
     training: Mapping[str, Any] | None
@@ -70,7 +70,7 @@ class Entry:
     episodes: tuple[PlayedActions, ...]
 
     @functools.cached_property
-    def result(self) -> EvaluationResult:
+    def result(self) -> Evaluation:
         """The evaluation, as tables take it; the time that episodes took is unknown, 0."""
         identity, agent = self.identity, self.identity["agent_identity"]
         words = {
@@ -85,7 +85,7 @@ class Entry:
             "identity": identity_hash(identity),
         }
         episodes = tuple(Episode(**words, **one.facts, wall_time_s=0.0) for one in self.episodes)
-        return EvaluationResult(episodes, identity, self.command)
+        return Evaluation(episodes, identity, self.command)
 
 
 def facts_of(episode: Any) -> dict[str, Any]:

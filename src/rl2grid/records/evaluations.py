@@ -20,7 +20,7 @@ EVALUATION_FILE = "evaluation.json"
 
 
 @dataclass(frozen=True)
-class EvaluationResult:
+class Evaluation:
     """All episodes of one agent on one task."""
 
     episodes: tuple[Episode, ...]
@@ -63,7 +63,7 @@ def read_request(path: Path) -> dict[str, Any]:
         raise UsageError(f"{path} is no description of an evaluation: {error!r}.") from None
 
 
-def load_evaluation(folder: Path) -> EvaluationResult:
+def load_evaluation(folder: Path) -> Evaluation:
     """A finished evaluation.
 
     Raises:
@@ -74,7 +74,7 @@ def load_evaluation(folder: Path) -> EvaluationResult:
     request = read_request(folder / EVALUATION_FILE)
     if not (folder / EPISODES_FILE).is_file():
         raise UsageError(f"The evaluation in {folder} is unfinished: continue it with {_continuing(request, folder)}.")
-    return EvaluationResult(read_episodes(folder / EPISODES_FILE), request["identity"], request["command"], folder)
+    return Evaluation(read_episodes(folder / EPISODES_FILE), request["identity"], request["command"], folder)
 
 
 def _continuing(request: Mapping[str, Any], folder: Path) -> str:
@@ -85,7 +85,7 @@ def _continuing(request: Mapping[str, Any], folder: Path) -> str:
     return f"{command}, with output={str(folder)!r}"
 
 
-def check_comparable(results: Sequence[EvaluationResult]) -> None:
+def check_comparable(results: Sequence[Evaluation]) -> None:
     """Refuse results that do not belong into one table.
 
     Agents and heuristics may differ, the question asked of them may not.
@@ -114,5 +114,5 @@ def check_comparable(results: Sequence[EvaluationResult]) -> None:
 _MAY_DIFFER = frozenset({"agent", "agent_identity", "heuristic", "normalize"})
 
 
-def _played(result: EvaluationResult) -> set[tuple[str, int, int]]:
+def _played(result: Evaluation) -> set[tuple[str, int, int]]:
     return {(episode.scenario, episode.seed, episode.start) for episode in result.episodes}

@@ -11,7 +11,7 @@ from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
 from rl2grid.mdp.constraints import THRESHOLDS
 from rl2grid.records.episodes import Episode
-from rl2grid.records.evaluations import EvaluationResult, check_comparable
+from rl2grid.records.evaluations import Evaluation, check_comparable
 from rl2grid.records.statistics import Scores, Unit
 from rl2grid.records.summary import by_scenario, safe_episodes
 
@@ -25,12 +25,12 @@ _OF_THE_AGENT = frozenset({"agent", "agent_identity", "heuristic", "normalize"})
 class Method:
     """Results of one agent with one heuristic on one task; with several of them, each is of another training run."""
 
-    results: tuple[EvaluationResult, ...]
+    evaluations: tuple[Evaluation, ...]
 
     @property
     def first(self) -> Episode:
         """Any episode: task, agent and heuristic are those of all."""
-        return self.results[0].episodes[0]
+        return self.evaluations[0].episodes[0]
 
     @property
     def task(self) -> Task:
@@ -57,16 +57,16 @@ class Method:
     @property
     def episodes(self) -> tuple[Episode, ...]:
         """Of all runs."""
-        return tuple(episode for result in self.results for episode in result.episodes)
+        return tuple(episode for result in self.evaluations for episode in result.episodes)
 
     @property
     def scenarios(self) -> tuple[str, ...]:
         """Ids in the order in which scores have them."""
-        return tuple(sorted({episode.scenario for episode in self.results[0].episodes}))
+        return tuple(sorted({episode.scenario for episode in self.evaluations[0].episodes}))
 
     def scores(self, column: str) -> Scores:
         """A column of :class:`~rl2grid.records.episodes.Episode`."""
-        return Scores(np.stack([by_scenario(result.episodes, column) for result in self.results]))
+        return Scores(np.stack([by_scenario(result.episodes, column) for result in self.evaluations]))
 
     def within(self, constraint: str) -> Scores:
         """1 for episodes whose cost reached its threshold at most, else 0."""
@@ -75,7 +75,7 @@ class Method:
     def safe(self, constraint: str) -> Scores:
         """1 for episodes that were completed as well: dying early is not safety."""
         limits = {constraint: THRESHOLDS[constraint]}
-        return Scores(np.stack([safe_episodes(result.episodes, limits) for result in self.results]))
+        return Scores(np.stack([safe_episodes(result.episodes, limits) for result in self.evaluations]))
 
 
 def method_label(episode: Episode) -> str:
@@ -83,7 +83,7 @@ def method_label(episode: Episode) -> str:
     return episode.agent if episode.heuristic == "none" else f"{episode.agent} + {episode.heuristic}"
 
 
-def group_methods(results: Sequence[EvaluationResult]) -> dict[str, tuple[Method, ...]]:
+def group_methods(results: Sequence[Evaluation]) -> dict[str, tuple[Method, ...]]:
     """Methods by task, both in order of appearance.
 
     Raises:
@@ -91,7 +91,7 @@ def group_methods(results: Sequence[EvaluationResult]) -> dict[str, tuple[Method
     """
     if not results:
         raise UsageError("There are no results: give at least one evaluation.")
-    by_task: dict[str, list[EvaluationResult]] = {}
+    by_task: dict[str, list[Evaluation]] = {}
     for result in results:
         by_task.setdefault(str(result.identity["task"]), []).append(result)
     for group in by_task.values():
@@ -106,8 +106,8 @@ def resampled_units(methods: Iterable[Method]) -> str:
     return ", else ".join(unit.value for unit in Unit if unit in units)
 
 
-def _methods(results: Sequence[EvaluationResult]) -> tuple[Method, ...]:
-    groups: dict[tuple[str, str], list[EvaluationResult]] = {}
+def _methods(results: Sequence[Evaluation]) -> tuple[Method, ...]:
+    groups: dict[tuple[str, str], list[Evaluation]] = {}
     for result in results:
         group = groups.setdefault((result.episodes[0].agent, result.episodes[0].heuristic), [])
         if any(result.episodes[0].agent_hash == other.episodes[0].agent_hash for other in group):
@@ -120,7 +120,7 @@ def _methods(results: Sequence[EvaluationResult]) -> tuple[Method, ...]:
     return tuple(Method(tuple(group)) for group in groups.values())
 
 
-def _check_other_training(result: EvaluationResult, group: Sequence[EvaluationResult]) -> None:
+def _check_other_training(result: Evaluation, group: Sequence[Evaluation]) -> None:
     """Evaluations of one method are repeated trainings: of other seeds, by the same algorithm."""
     mine = _training(result)
     if mine is None:
@@ -139,14 +139,14 @@ def _check_other_training(result: EvaluationResult, group: Sequence[EvaluationRe
             )
 
 
-def _training(result: EvaluationResult) -> tuple[str | None, int] | None:
+def _training(result: Evaluation) -> tuple[str | None, int] | None:
     """Algorithm and seed with which the agent was trained; None where its identity does not say."""
     identity = result.identity.get("agent_identity") or {}
     seed = identity.get("trained_with", {}).get("seed")
     return None if seed is None else (identity.get("algorithm"), int(seed))
 
 
-def _check_same_question(results: Sequence[EvaluationResult]) -> None:
+def _check_same_question(results: Sequence[Evaluation]) -> None:
     """Tasks may differ, what is asked on each of them may not."""
     first = results[0].identity
     for other in (result.identity for result in results[1:]):

@@ -31,9 +31,9 @@ from filelock import FileLock, Timeout
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.flags import evaluate_command
 from rl2grid.evaluation.protocol import evaluate
+from rl2grid.records.collection import CELL_FILE, EVALUATION_FOLDER, RESULT_FILE, RUN_FOLDER
 from rl2grid.records.episodes import EPISODES_FILE
 from rl2grid.records.files import write_json
-from rl2grid.records.sources import CELL_FILE, EVALUATION_FOLDER, RESULT_FILE, RUN_FOLDER
 from rl2grid.records.trainings import METRICS_FILE
 from rl2grid.studies.study import Cell, Training, cell_from_dict, cell_to_dict
 from rl2grid.training import runs

@@ -14,14 +14,14 @@ import gymnasium
 from rich.console import Console
 
 from rl2grid.analysis.report import write_report
-from rl2grid.analysis.tables import rich_table
+from rl2grid.analysis.summary_table import rich_table
 from rl2grid.envs.registration import register_all
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import make_agent
 from rl2grid.evaluation.flags import flags
 from rl2grid.evaluation.protocol import evaluate
 from rl2grid.evaluation.recording import record_episode
-from rl2grid.records.evaluations import EvaluationResult
+from rl2grid.records.evaluations import Evaluation
 from rl2grid.records.recordings import Recording
 from rl2grid.records.trainings import read_training_curve
 from rl2grid.scenarios.library import list_scenarios
@@ -111,7 +111,7 @@ def _train(folder: Path, decisions: int) -> Path:
     return runs.train(args, evaluate=validator(args))
 
 
-def _evaluate(agent: str, heuristic: str | None, output: Path) -> EvaluationResult:
+def _evaluate(agent: str, heuristic: str | None, output: Path) -> Evaluation:
     name = agent if agent in ("do-nothing", "random") else "PPO"
     return evaluate(
         agent,

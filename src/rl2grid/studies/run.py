@@ -26,9 +26,9 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from rl2grid.records.collection import EVALUATION_FOLDER, RUN_FOLDER, STUDY_FILE
 from rl2grid.records.episodes import COLUMNS, EPISODES_FILE, format_row, read_episodes
 from rl2grid.records.files import make_folder, write_json
-from rl2grid.records.sources import EVALUATION_FOLDER, RUN_FOLDER, STUDY_FILE
 from rl2grid.records.trainings import METRICS_FILE, VALIDATION
 from rl2grid.records.versions import library_versions
 from rl2grid.studies.backends import Backend, Job

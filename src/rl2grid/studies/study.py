@@ -35,7 +35,7 @@ from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import AGENTS, kinds_of
 from rl2grid.evaluation.protocol import evenly_spread
 from rl2grid.mdp.rewards import resolve_reward
-from rl2grid.records.sources import CELLS_FOLDER
+from rl2grid.records.collection import CELLS_FOLDER
 from rl2grid.scenarios.splits import SPLITS
 from rl2grid.studies.toml_file import (
     as_table,

@@ -18,7 +18,7 @@ CACHES = ("series", "packs")
 """Folders below the data folder whose content is made again when needed."""
 
 
-class Holding(NamedTuple):
+class StoredSeries(NamedTuple):
     """Series of one kind."""
 
     grid_id: str
@@ -31,21 +31,21 @@ class Holding(NamedTuple):
     place: Path
 
 
-def holdings(grid: Grid) -> list[Holding]:
+def inventory(grid: Grid) -> list[StoredSeries]:
     """Everything there is of a grid; kinds of which there is nothing are left out."""
     bundled = list(bundled_folders(grid).values())
     found = [
-        Holding(grid.id, "bundled", f"{len(bundled)} series", sum(map(size_of, bundled)), bundled[0].parent),
+        StoredSeries(grid.id, "bundled", f"{len(bundled)} series", sum(map(size_of, bundled)), bundled[0].parent),
         *_generated(grid),
     ]
     names = imported_names(grid)
     if names:
         folder = imported_folder(grid)
-        found.append(Holding(grid.id, "imported", _some(names), size_of(folder), folder))
+        found.append(StoredSeries(grid.id, "imported", _some(names), size_of(folder), folder))
     dataset = full_data_folder() / grid.grid2op_name
     if dataset.is_dir():
         scenarios = sum(1 for pattern in ("chronics/*/", "*/chronics/*/") for _ in dataset.glob(pattern))
-        found.append(Holding(grid.id, "full", f"{scenarios:,} scenarios", size_of(dataset), dataset))
+        found.append(StoredSeries(grid.id, "full", f"{scenarios:,} scenarios", size_of(dataset), dataset))
     return found
 
 
@@ -65,7 +65,7 @@ def remove_caches() -> None:
         shutil.rmtree(data_folder() / name, ignore_errors=True)
 
 
-def _generated(grid: Grid) -> list[Holding]:
+def _generated(grid: Grid) -> list[StoredSeries]:
     folder = pack_folder(grid)
     packs = list(folder.glob("*.pack"))
     if not packs:
@@ -77,7 +77,7 @@ def _generated(grid: Grid) -> list[Holding]:
         made = sum(pack_path(grid, each.seed, each.first).is_file() for each in months)
         if made:
             parts.append(f"{split} {made}/{len(names)}")
-    return [Holding(grid.id, "generated", ", ".join(parts), size_of(folder), folder)]
+    return [StoredSeries(grid.id, "generated", ", ".join(parts), size_of(folder), folder)]
 
 
 def _some(names: tuple[str, ...], limit: int = 5) -> str:

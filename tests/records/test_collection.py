@@ -10,27 +10,27 @@ from sample_folders import CELLS, cell, write_made_up_evaluation, write_made_up_
 from sample_results import TASK
 
 from rl2grid.errors import UsageError
+from rl2grid.records.collection import collect
 from rl2grid.records.episodes import EPISODES_FILE
-from rl2grid.records.sources import load_sources
 
 
 def test_runs_bring_their_evaluations_on_the_split(tmp_path):
     write_made_up_run(tmp_path / "run")
     for name in ("validation", "validation-idle", "test"):
         write_made_up_evaluation(tmp_path / "run" / "evaluation" / name)
-    sources = load_sources([str(tmp_path / "run")])
-    assert [one.folder.name for one in sources.results if one.folder] == ["validation", "validation-idle"]
-    assert [(run.curve.label, run.seed) for run in sources.runs] == [("ppo + idle", 1)]
-    assert sources.missing == []
-    assert len(load_sources([str(tmp_path / "run")], "test").results) == 1
+    collection = collect([str(tmp_path / "run")])
+    assert [one.folder.name for one in collection.evaluations if one.folder] == ["validation", "validation-idle"]
+    assert [(run.curve.label, run.seed) for run in collection.runs] == [("ppo + idle", 1)]
+    assert collection.missing == []
+    assert len(collect([str(tmp_path / "run")], "test").evaluations) == 1
 
 
 def test_what_a_run_lacks_is_told(tmp_path):
     write_made_up_run(tmp_path / "run")
-    sources = load_sources([f"mine={tmp_path / 'run'}"])
-    assert sources.results == []
-    assert sources.runs[0].curve.label == "mine"
-    assert sources.missing == [
+    collection = collect([f"mine={tmp_path / 'run'}"])
+    assert collection.evaluations == []
+    assert collection.runs[0].curve.label == "mine"
+    assert collection.missing == [
         f"Run {tmp_path / 'run'} was not evaluated on validation: rl2grid evaluate {tmp_path / 'run'} {TASK} "
         "--split validation"
     ]
@@ -39,34 +39,34 @@ def test_what_a_run_lacks_is_told(tmp_path):
 def test_a_study_brings_every_finished_cell_under_its_name(tmp_path):
     unfinished = cell("bus14-T0-v0-ppo-idle-3", seed=3, finished=False)
     write_made_up_study(tmp_path, [*map(dict, CELLS), unfinished])
-    sources = load_sources([str(tmp_path)])
-    agents = [one.episodes[0].agent for one in sources.results]
+    collection = collect([str(tmp_path)])
+    agents = [one.episodes[0].agent for one in collection.evaluations]
     assert agents == ["ppo", "ppo", "ppo small-nets", "do-nothing"]
-    labels = [(run.curve.label, run.seed) for run in sources.runs]
+    labels = [(run.curve.label, run.seed) for run in collection.runs]
     assert labels == [("ppo + idle", 1), ("ppo + idle", 2), ("ppo small-nets + idle", 1)]
-    assert sources.missing == [f"Cell bus14-T0-v0-ppo-idle-3 of the study {tmp_path} is not finished."]
+    assert collection.missing == [f"Cell bus14-T0-v0-ppo-idle-3 of the study {tmp_path} is not finished."]
 
 
 def test_the_only_scale_of_a_study_is_found(tmp_path):
     write_made_up_study(tmp_path / "quick", [dict(CELLS[0])])
-    assert len(load_sources([str(tmp_path)]).results) == 1
+    assert len(collect([str(tmp_path)]).evaluations) == 1
     write_made_up_study(tmp_path / "full", [dict(CELLS[0])])
     with pytest.raises(UsageError, match=r"holds several studies: give one of .*full, .*quick"):
-        load_sources([str(tmp_path)])
+        collect([str(tmp_path)])
 
 
 def test_a_cell_of_a_study_is_a_folder_like_others(tmp_path):
     write_made_up_study(tmp_path, [dict(one) for one in CELLS])
-    sources = load_sources([str(tmp_path / "cells" / CELLS[2]["name"])])
-    assert [one.episodes[0].agent for one in sources.results] == ["ppo small-nets"]
-    assert len(sources.runs) == 1
-    named = load_sources([f"mine={tmp_path / 'cells' / CELLS[2]['name']}"])
-    assert named.results[0].episodes[0].agent == named.runs[0].curve.label == "mine"
+    collection = collect([str(tmp_path / "cells" / CELLS[2]["name"])])
+    assert [one.episodes[0].agent for one in collection.evaluations] == ["ppo small-nets"]
+    assert len(collection.runs) == 1
+    named = collect([f"mine={tmp_path / 'cells' / CELLS[2]['name']}"])
+    assert named.evaluations[0].episodes[0].agent == named.runs[0].curve.label == "mine"
 
 
 def test_a_label_renames_episodes_alone(tmp_path):
     write_made_up_evaluation(tmp_path / "one")
-    named, plain = (load_sources([words]).results[0] for words in (f"mine={tmp_path / 'one'}", str(tmp_path / "one")))
+    named, plain = (collect([words]).evaluations[0] for words in (f"mine={tmp_path / 'one'}", str(tmp_path / "one")))
     assert [asdict(episode) for episode in named.episodes] == [
         asdict(replace(episode, agent="mine")) for episode in plain.episodes
     ]
@@ -93,5 +93,5 @@ def test_refusals_are_one_sentence(tmp_path, words, split, part):
     (tmp_path / "run" / "metrics.csv").unlink()
     write_made_up_study(tmp_path / "study", [dict(CELLS[0])])
     with pytest.raises(UsageError, match=re.escape(part)) as refusal:
-        load_sources([words.format(tmp_path)], split)
+        collect([words.format(tmp_path)], split)
     assert "\n" not in str(refusal.value)

@@ -29,7 +29,7 @@ from rl2grid.evaluation.episode import PlayedEpisode, play_episode
 
 _REPORT_SECONDS = 0.5
 
-_WORKER = "from rl2grid.evaluation.players import main; main()"
+_WORKER = "from rl2grid.evaluation.crew import main; main()"
 """Not ``python -m``: what a worker sends must be of the classes of this module, not of a ``__main__``."""
 _ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 """Workers are the parallelism: threads of theirs would only compete."""
@@ -66,7 +66,7 @@ class Progress(NamedTuple):
 OnProgress = Callable[[Progress], None]
 
 
-class Players(Protocol):
+class Crew(Protocol):
     """Plays episodes and tells of them as they go."""
 
     def play(self, jobs: Sequence[Job], on_progress: OnProgress) -> Iterator[PlayedEpisode]:
@@ -84,12 +84,12 @@ class Players(Protocol):
     ) -> None: ...
 
 
-def players(setting: Setting, workers: int) -> Players:
+def make_crew(setting: Setting, workers: int) -> Crew:
     """``workers`` processes, or this one if there are to be none."""
-    return RemotePlayers(setting, workers) if workers else LocalPlayers(setting)
+    return WorkerCrew(setting, workers) if workers else LocalCrew(setting)
 
 
-class Player:
+class BoundAgent:
     """One environment and the agent bound to it."""
 
     def __init__(self, setting: Setting) -> None:
@@ -121,28 +121,28 @@ class Player:
         self._env.close()
 
 
-class LocalPlayers:
+class LocalCrew:
     """Plays in this process, one episode after the other."""
 
     def __init__(self, setting: Setting) -> None:
         self._setting = setting
-        self._player: Player | None = None
+        self._agent: BoundAgent | None = None
 
     def play(self, jobs: Sequence[Job], on_progress: OnProgress) -> Iterator[PlayedEpisode]:
-        """See :class:`Players`."""
-        self._player = Player(self._setting)
+        """See :class:`Crew`."""
+        self._agent = BoundAgent(self._setting)
         for job in jobs:
-            yield self._player.play(job, on_progress)
+            yield self._agent.play(job, on_progress)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._player is not None:
-            self._player.close()
+        if self._agent is not None:
+            self._agent.close()
 
 
-class RemotePlayers:
+class WorkerCrew:
     """Plays in worker processes, each with an environment of its own."""
 
     def __init__(self, setting: Setting, workers: int) -> None:
@@ -151,7 +151,7 @@ class RemotePlayers:
         self._running: list[_Worker] = []
 
     def play(self, jobs: Sequence[Job], on_progress: OnProgress) -> Iterator[PlayedEpisode]:
-        """See :class:`Players`."""
+        """See :class:`Crew`."""
         waiting = list(reversed(jobs))
         open_jobs = len(waiting)
         for _ in range(min(self._workers, open_jobs)):
@@ -251,14 +251,14 @@ def serve(requests: BinaryIO, answers: BinaryIO) -> None:
         answers.flush()
 
     try:
-        player = Player(pickle.load(requests))
+        bound = BoundAgent(pickle.load(requests))
         while True:
             try:
                 job = pickle.load(requests)
             except EOFError:
                 break
-            answer("played", player.play(job, lambda progress: answer("progress", progress)))
-        player.close()
+            answer("played", bound.play(job, lambda progress: answer("progress", progress)))
+        bound.close()
     except UsageError as error:
         answer("refused", str(error))
     except BrokenPipeError:

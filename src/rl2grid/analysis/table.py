@@ -1,4 +1,4 @@
-"""Tables of results: for the terminal, and as Markdown, LaTeX (booktabs) and CSV."""
+"""A table of results and what it is written as: for the terminal, and as Markdown, LaTeX (booktabs) and CSV."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from rich.table import Table
 from rich.text import Text
 
 from rl2grid.records.statistics import Estimate
-from rl2grid.records.summary import Summary
 
 
 @dataclass(frozen=True)
@@ -66,7 +65,7 @@ def mean_cell(estimate: Estimate, *, digits: int = 2, best: bool = False) -> Cel
 
 def interval_cell(estimate: Estimate, *, digits: int = 3, best: bool = False) -> Cell:
     """A value and both ends of its interval, as "0.970 [0.950, 0.990]"."""
-    return Cell(_with_interval(estimate, digits), estimate, best)
+    return Cell(with_interval(estimate, digits), estimate, best)
 
 
 def share_cell(estimate: Estimate) -> Cell:
@@ -98,9 +97,9 @@ def result_table_rich(table: ResultTable, title: str | None = None) -> Table:
 def table_markdown(table: ResultTable) -> str:
     """A table as Markdown; a column of a group is headed "group heading"."""
     headings = [f"{column.group} {column.heading}".strip() for column in table.columns]
-    lines = [_markdown_row(headings), _markdown_row([":--" if column.words else "--:" for column in table.columns])]
+    lines = [markdown_row(headings), markdown_row([":--" if column.words else "--:" for column in table.columns])]
     for row in table.rows:
-        lines.append(_markdown_row([f"**{cell.text}**" if cell.best else cell.text for cell in row]))
+        lines.append(markdown_row([f"**{cell.text}**" if cell.best else cell.text for cell in row]))
     return "\n".join(lines) + f"\n\n{table.caption}\n"
 
 
@@ -142,97 +141,14 @@ WRITERS: dict[str, Callable[[ResultTable], str]] = {"md": table_markdown, "tex":
 """Writer of each format, by the suffix of its files."""
 
 
-HEADINGS: tuple[str, ...] = (
-    "agent",
-    "heuristic",
-    "episodes",
-    "survival",
-    "IQM survival",
-    "completed",
-    "return",
-    "LSI cost",
-    "safe LSI",
-    "TLO cost",
-    "safe TLO",
-    "margin",
-    "overload",
-    "topology",
-)
-N_LABELS = 2
-"""Leading columns that hold words."""
-
-LEGEND = (
-    "Means per episode with 95% bootstrap intervals: over seeds within scenarios, or over scenarios where each was "
-    "played with one seed. Survival: share of the episode survived; "
-    "IQM: interquartile mean. Safe: cost within the threshold and episode completed. "
-    "Margin, overload, topology: the operational scores, means per step."
-)
+def with_interval(estimate: Estimate, digits: int) -> str:
+    """A value and both ends of its interval, as "0.970 [0.950, 0.990]"."""
+    return f"{estimate.value:.{digits}f} [{estimate.low:.{digits}f}, {estimate.high:.{digits}f}]"
 
 
-def table_cells(summary: Summary) -> list[str]:
-    """The cells of one agent, under :data:`HEADINGS`."""
-    return [
-        summary.agent,
-        summary.heuristic,
-        str(summary.episodes),
-        _with_interval(summary.survival, 3),
-        _with_interval(summary.survival_iqm, 3),
-        _percent(summary.completed),
-        _number(summary.episode_return),
-        _number(summary.cost_lsi),
-        _percent(summary.safe_lsi),
-        _number(summary.cost_tlo),
-        _percent(summary.safe_tlo),
-        _number(summary.score_margin),
-        _number(summary.score_overload),
-        _number(summary.score_topology),
-    ]
-
-
-def rich_table(summaries: Sequence[Summary], title: str | None = None) -> Table:
-    """A table for the terminal, 80 characters wide: long names are folded; the best survival is bold.
-
-    "Done" is the share of episodes completed.
-    """
-    table = Table(
-        title=title,
-        title_justify="left",
-        title_style="bold",
-        box=rich.box.SIMPLE_HEAD,
-        pad_edge=False,
-        padding=(0, 1, 0, 0),
-    )
-    table.add_column("agent", overflow="fold")
-    for heading in ("survival", "done", "return", "LSI\ncost", "safe\nLSI", "TLO\ncost", "safe\nTLO"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    for summary in summaries:
-        cells = dict(zip(HEADINGS, table_cells(summary), strict=True))
-        table.add_row(
-            summary.agent if summary.heuristic == "none" else f"{summary.agent} + {summary.heuristic}",
-            *(
-                cells[name]
-                for name in ("survival", "completed", "return", "LSI cost", "safe LSI", "TLO cost", "safe TLO")
-            ),
-            style="bold" if is_best(summary, summaries) else None,
-        )
-    return table
-
-
-def markdown_table(summaries: Sequence[Summary]) -> str:
-    """A Markdown table with every column; the best survival is bold."""
-    lines = [_markdown_row(HEADINGS), _markdown_row([":--" if k < N_LABELS else "--:" for k in range(len(HEADINGS))])]
-    for summary in summaries:
-        cells = table_cells(summary)
-        survival = HEADINGS.index("survival")
-        if is_best(summary, summaries):
-            cells[survival] = f"**{cells[survival]}**"
-        lines.append(_markdown_row(cells))
-    return "\n".join(lines) + "\n"
-
-
-def is_best(summary: Summary, summaries: Sequence[Summary]) -> bool:
-    """Whether no other agent survives longer on average; of one agent alone, nobody is best."""
-    return len(summaries) > 1 and summary.survival.value == max(other.survival.value for other in summaries)
+def markdown_row(cells: Sequence[str]) -> str:
+    """One line of a Markdown table; pipes within cells are escaped."""
+    return f"| {' | '.join(cell.replace('|', '&#124;') for cell in cells)} |"
 
 
 def _latex_groups(columns: Sequence[Column]) -> list[str]:
@@ -266,25 +182,3 @@ def _csv_numbers(cell: Cell) -> list[object]:
     if cell.estimate is None:
         return ["", "", ""]
     return [cell.estimate.value, cell.estimate.low, cell.estimate.high]
-
-
-def _markdown_row(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cell.replace('|', '&#124;') for cell in cells)} |"
-
-
-def _with_interval(estimate: Estimate, digits: int) -> str:
-    return f"{estimate.value:.{digits}f} [{estimate.low:.{digits}f}, {estimate.high:.{digits}f}]"
-
-
-def _percent(estimate: Estimate) -> str:
-    return f"{100 * estimate.value:.0f}%"
-
-
-def _number(estimate: Estimate) -> str:
-    """Three significant digits, thousands separated."""
-    value = estimate.value
-    if value == 0:
-        return "0"
-    if abs(value) >= 1000:
-        return f"{value:,.0f}"
-    return f"{value:.3g}"

@@ -1,4 +1,4 @@
-"""What tables and figures are made from: the evaluations and training runs that some folders hold.
+"""A collection of evaluations and training runs: what tables and figures are made from, found in some folders.
 
 A folder is one of
 
@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from rl2grid.errors import UsageError
-from rl2grid.records.evaluations import EVALUATION_FILE, EvaluationResult, load_evaluation
+from rl2grid.records.evaluations import EVALUATION_FILE, Evaluation, load_evaluation
 from rl2grid.records.trainings import RUN_FILE, TrainingRun, read_training_run
 from rl2grid.scenarios.splits import VALIDATION
 
@@ -27,16 +27,16 @@ RUN_FOLDER, EVALUATION_FOLDER = "run", "evaluation"
 
 
 @dataclass
-class Sources:
+class Collection:
     """Evaluations and runs in the order given."""
 
-    results: list[EvaluationResult] = field(default_factory=list)
+    evaluations: list[Evaluation] = field(default_factory=list)
     runs: list[TrainingRun] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)
     """One sentence for each thing that was to be expected and is not there."""
 
 
-def load_sources(folders: Sequence[str], split: str | None = None) -> Sources:
+def collect(folders: Sequence[str], split: str | None = None) -> Collection:
     """What the folders hold.
 
     Args:
@@ -46,24 +46,24 @@ def load_sources(folders: Sequence[str], split: str | None = None) -> Sources:
     Raises:
         UsageError: a folder that holds nothing of the kind, or from which something is missing.
     """
-    sources = Sources()
+    collection = Collection()
     for words in folders:
-        label, folder = parse_source(words)
+        label, folder = parse_folder(words)
         if not folder.is_dir():
             raise UsageError(f"{folder} is no folder: give folders that 'rl2grid' wrote.")
         study = _study_folder(folder)
         if study is not None and label is not None:
             raise UsageError(f"A study has names of its own: give {folder} without {label}=.")
         if study is not None:
-            _add_study(sources, study, split)
+            _add_study(collection, study, split)
         elif (folder / CELL_FILE).is_file():
-            _add_cell(sources, folder, label)
+            _add_cell(collection, folder, label)
         else:
-            _add_folder(sources, folder, label, split or VALIDATION)
-    return sources
+            _add_folder(collection, folder, label, split or VALIDATION)
+    return collection
 
 
-def parse_source(words: str) -> tuple[str | None, Path]:
+def parse_folder(words: str) -> tuple[str | None, Path]:
     """Label and folder; a folder whose own name has an equals sign is a folder.
 
     Raises:
@@ -85,14 +85,14 @@ def find_evaluations(folder: Path, split: str) -> list[Path]:
     return sorted(path for path in below if (path / EVALUATION_FILE).is_file())
 
 
-def _add_folder(sources: Sources, folder: Path, label: str | None, split: str) -> None:
+def _add_folder(collection: Collection, folder: Path, label: str | None, split: str) -> None:
     evaluations = find_evaluations(folder, split)
-    sources.results += [_named(load_evaluation(evaluation), label) for evaluation in evaluations]
+    collection.evaluations += [_named(load_evaluation(evaluation), label) for evaluation in evaluations]
     if (folder / RUN_FILE).is_file():
         run = read_training_run(folder, label)
-        sources.runs.append(run)
+        collection.runs.append(run)
         if not evaluations:
-            sources.missing.append(
+            collection.missing.append(
                 f"Run {folder} was not evaluated on {split}: rl2grid evaluate {folder} {run.task} --split {split}"
             )
     elif not evaluations:
@@ -112,32 +112,34 @@ def _study_folder(folder: Path) -> Path | None:
     return scales[0] if scales else None
 
 
-def _add_study(sources: Sources, folder: Path, split: str | None) -> None:
+def _add_study(collection: Collection, folder: Path, split: str | None) -> None:
     taken = 0
     for entry in _read_json(folder / STUDY_FILE)["cells"]:
         cell = folder / CELLS_FOLDER / entry["cell"]
         if not (cell / RESULT_FILE).is_file():
-            sources.missing.append(f"Cell {cell.name} of the study {folder} is not finished.")
+            collection.missing.append(f"Cell {cell.name} of the study {folder} is not finished.")
             continue
         played = _read_json(cell / CELL_FILE)["split"]
         if split not in (None, played):
-            sources.missing.append(f"Cell {cell.name} of the study {folder} was evaluated on {played}, not on {split}.")
+            collection.missing.append(
+                f"Cell {cell.name} of the study {folder} was evaluated on {played}, not on {split}."
+            )
             continue
-        _add_cell(sources, cell, None)
+        _add_cell(collection, cell, None)
         taken += 1
     if not taken:
         wanted = "finished cell" if split is None else f"finished cell that was evaluated on {split}"
         raise UsageError(f"The study {folder} has no {wanted} yet: 'rl2grid study status' says how far it is.")
 
 
-def _add_cell(sources: Sources, folder: Path, given: str | None) -> None:
+def _add_cell(collection: Collection, folder: Path, given: str | None) -> None:
     """One cell of a study: under the label given, else under that of its group."""
     cell = _read_json(folder / CELL_FILE)
     label = given or _cell_label(cell)
-    sources.results.append(_named(load_evaluation(folder / EVALUATION_FOLDER), label))
+    collection.evaluations.append(_named(load_evaluation(folder / EVALUATION_FOLDER), label))
     if cell["training"] is not None:
         curve = label if given or not label or not cell["heuristic"] else f"{label} + {cell['heuristic']}"
-        sources.runs.append(read_training_run(folder / RUN_FOLDER, curve))
+        collection.runs.append(read_training_run(folder / RUN_FOLDER, curve))
 
 
 def _cell_label(cell: Mapping[str, Any]) -> str | None:
@@ -149,7 +151,7 @@ def _cell_label(cell: Mapping[str, Any]) -> str | None:
     return f"{cell['agent']} {label}" if label else None
 
 
-def _named(result: EvaluationResult, label: str | None) -> EvaluationResult:
+def _named(result: Evaluation, label: str | None) -> Evaluation:
     if label is None:
         return result
     return replace(result, episodes=tuple(replace(episode, agent=label) for episode in result.episodes))

@@ -1,0 +1,118 @@
+"""The summaries of several agents on one task, side by side: for the terminal, and as Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import rich.box
+from rich.table import Table
+
+from rl2grid.analysis.table import markdown_row, with_interval
+from rl2grid.records.statistics import Estimate
+from rl2grid.records.summary import Summary
+
+HEADINGS: tuple[str, ...] = (
+    "agent",
+    "heuristic",
+    "episodes",
+    "survival",
+    "IQM survival",
+    "completed",
+    "return",
+    "LSI cost",
+    "safe LSI",
+    "TLO cost",
+    "safe TLO",
+    "margin",
+    "overload",
+    "topology",
+)
+N_LABELS = 2
+"""Leading columns that hold words."""
+
+LEGEND = (
+    "Means per episode with 95% bootstrap intervals: over seeds within scenarios, or over scenarios where each was "
+    "played with one seed. Survival: share of the episode survived; "
+    "IQM: interquartile mean. Safe: cost within the threshold and episode completed. "
+    "Margin, overload, topology: the operational scores, means per step."
+)
+
+
+def table_cells(summary: Summary) -> list[str]:
+    """The cells of one agent, under :data:`HEADINGS`."""
+    return [
+        summary.agent,
+        summary.heuristic,
+        str(summary.episodes),
+        with_interval(summary.survival, 3),
+        with_interval(summary.survival_iqm, 3),
+        _percent(summary.completed),
+        _number(summary.episode_return),
+        _number(summary.cost_lsi),
+        _percent(summary.safe_lsi),
+        _number(summary.cost_tlo),
+        _percent(summary.safe_tlo),
+        _number(summary.score_margin),
+        _number(summary.score_overload),
+        _number(summary.score_topology),
+    ]
+
+
+def rich_table(summaries: Sequence[Summary], title: str | None = None) -> Table:
+    """A table for the terminal, 80 characters wide: long names are folded; the best survival is bold.
+
+    "Done" is the share of episodes completed.
+    """
+    table = Table(
+        title=title,
+        title_justify="left",
+        title_style="bold",
+        box=rich.box.SIMPLE_HEAD,
+        pad_edge=False,
+        padding=(0, 1, 0, 0),
+    )
+    table.add_column("agent", overflow="fold")
+    for heading in ("survival", "done", "return", "LSI\ncost", "safe\nLSI", "TLO\ncost", "safe\nTLO"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for summary in summaries:
+        cells = dict(zip(HEADINGS, table_cells(summary), strict=True))
+        table.add_row(
+            summary.agent if summary.heuristic == "none" else f"{summary.agent} + {summary.heuristic}",
+            *(
+                cells[name]
+                for name in ("survival", "completed", "return", "LSI cost", "safe LSI", "TLO cost", "safe TLO")
+            ),
+            style="bold" if is_best(summary, summaries) else None,
+        )
+    return table
+
+
+def markdown_table(summaries: Sequence[Summary]) -> str:
+    """A Markdown table with every column; the best survival is bold."""
+    lines = [markdown_row(HEADINGS), markdown_row([":--" if k < N_LABELS else "--:" for k in range(len(HEADINGS))])]
+    for summary in summaries:
+        cells = table_cells(summary)
+        survival = HEADINGS.index("survival")
+        if is_best(summary, summaries):
+            cells[survival] = f"**{cells[survival]}**"
+        lines.append(markdown_row(cells))
+    return "\n".join(lines) + "\n"
+
+
+def is_best(summary: Summary, summaries: Sequence[Summary]) -> bool:
+    """Whether no other agent survives longer on average; of one agent alone, nobody is best."""
+    return len(summaries) > 1 and summary.survival.value == max(other.survival.value for other in summaries)
+
+
+def _percent(estimate: Estimate) -> str:
+    return f"{100 * estimate.value:.0f}%"
+
+
+def _number(estimate: Estimate) -> str:
+    """Three significant digits, thousands separated."""
+    value = estimate.value
+    if value == 0:
+        return "0"
+    if abs(value) >= 1000:
+        return f"{value:,.0f}"
+    return f"{value:.3g}"
