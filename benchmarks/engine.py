@@ -288,7 +288,8 @@ def memory_and_construction(grid_id: str) -> dict[str, float]:
     seconds = time.perf_counter() - begin
     plan = plan_episode(grid, "train", 0, 0)
     engine.prepare(0, plan)
-    parts = (engine.arrays.state, engine.arrays.memory, engine.arrays.flow, engine.arrays.opponent)
+    environments = engine.environments
+    parts = (environments.state, environments.hidden, environments.flow, environments.opponent)
     size = sum(array.nbytes for part in parts for array in part if array.ndim and len(array) == 1000)
     return {"kilobytes": round(size / 1000 / 1000, 1), "seconds_for_1000": round(seconds, 3)}
 

@@ -388,11 +388,11 @@ def survive(engine: NativeEngine, grid: Grid, seed: int, month: int) -> int:
     if grid.opponent.kind != "none":
         draws = draw_opponent(grid, Stream(seed, month, Purpose.OPPONENT), scenario.n_steps)
     engine.begin(0, scenario, 0, scenario.n_steps, outages_of(outages), draws)
-    reset_one(engine.addresses, 0)
+    reset_one(engine.handle.address, 0)
     nothing = np.zeros(0, np.float32)
     steps = 0
     while not engine.state.terminated[0] and steps < scenario.n_steps:
-        step_one(engine.addresses, 0, int(ActionKind.NOTHING), 0, 0, nothing)
+        step_one(engine.handle.address, 0, int(ActionKind.NOTHING), 0, 0, nothing)
         steps += not engine.state.terminated[0]
     return steps
 

@@ -1,5 +1,7 @@
 """Handles: compiled code sees the very arrays of a NamedTuple, whatever their dtype and shape."""
 
+import copy
+import pickle
 from collections import namedtuple
 from typing import Any
 
@@ -8,7 +10,7 @@ import numpy as np
 import pytest
 from numba.core.errors import TypingError
 
-from rl2grid.handles import layout_of, opener, table_of
+from rl2grid.handles import Handle, layout_of, opener
 
 DTYPES = ("bool", "int8", "int32", "int64", "uint16", "uint32", "uint64", "float32", "float64")
 Arrays = namedtuple("Arrays", "flat table block four")
@@ -20,16 +22,10 @@ def arrays_of(dtype: str) -> Any:
     return Arrays(**{name: random.integers(0, 100, shape).astype(dtype) for name, shape in SHAPES.items()})
 
 
-def address_of(arrays: Any) -> tuple[int, Any]:
-    """Where the table lies, and the table, which has to be kept."""
-    table = table_of(arrays)
-    return table.ctypes.data, table
-
-
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_every_element_is_read_and_written_in_place(dtype):
     arrays = arrays_of(dtype)
-    open_arrays = opener(f"Arrays {dtype}", layout_of(arrays))
+    open_arrays = opener(layout_of(arrays))
 
     @numba.njit
     def move(source, target):
@@ -48,21 +44,24 @@ def test_every_element_is_read_and_written_in_place(dtype):
         return mine.flat.size, mine.table.shape, mine.block.strides, mine.four.size
 
     blank = Arrays(*(np.zeros_like(array) for array in arrays))
-    (source, table), (target, other) = address_of(arrays), address_of(blank)
-    size, shape, strides, elements = move(source, target)
+    source, target = Handle(arrays), Handle(blank)
+    size, shape, strides, elements = move(source.address, target.address)
     for mine, theirs in zip(blank, arrays, strict=True):
         np.testing.assert_array_equal(mine, theirs)
         assert theirs.any()
     assert (size, shape, strides, elements) == (5, (3, 4), arrays.block.strides, 12)
-    assert len(table) == len(other) == sum(1 + len(shape) for shape in SHAPES.values())
 
 
 Mixed = namedtuple("Mixed", "flags numbers empty")
 
 
+def mixed_arrays(flags: Any = (2, 3), numbers: Any = 4) -> Any:
+    return Mixed(np.zeros(flags, np.bool_), np.arange(float(numbers)), np.zeros((2, 0), np.float32))
+
+
 def test_fields_of_different_kinds_lie_side_by_side_and_may_be_empty():
-    mixed = Mixed(np.zeros((2, 3), np.bool_), np.arange(4.0), np.zeros((2, 0), np.float32))
-    open_mixed = opener("Mixed", layout_of(mixed))
+    mixed = mixed_arrays()
+    open_mixed = opener(layout_of(mixed))
 
     @numba.njit
     def touch(address):
@@ -71,16 +70,15 @@ def test_fields_of_different_kinds_lie_side_by_side_and_may_be_empty():
         handle.numbers[:] += 0.5
         return handle.empty.sum()
 
-    address, table = address_of(mixed)
-    assert touch(address) == 0.0
+    handle = Handle(mixed)
+    assert touch(handle.address) == 0.0
     assert mixed.flags.tolist() == [[False, False, False], [False, False, True]]
     assert mixed.numbers.tolist() == [0.5, 1.5, 2.5, 3.5]
-    assert table[-2:].tolist() == [2, 0]
 
 
 def test_a_handle_serves_functions_written_for_the_named_tuple():
-    mixed = Mixed(np.zeros((2, 3), np.bool_), np.arange(4.0), np.zeros((2, 0), np.float32))
-    open_mixed = opener("Mixed", layout_of(mixed))
+    mixed = mixed_arrays()
+    open_mixed = opener(layout_of(mixed))
 
     @numba.njit
     def total(arrays, k):
@@ -90,25 +88,71 @@ def test_a_handle_serves_functions_written_for_the_named_tuple():
     def through_a_handle(address):
         return total(open_mixed(address), 1)
 
-    address, table = address_of(mixed)
-    assert through_a_handle(address) == total(mixed, 1) == 6.0
-    assert table.dtype == np.int64
+    handle = Handle(mixed)
+    assert through_a_handle(handle.address) == total(mixed, 1) == 6.0
 
 
 def test_one_function_serves_arrays_of_any_size():
-    open_mixed = opener(
-        "Mixed", layout_of(Mixed(np.zeros((0, 0), np.bool_), np.zeros(0), np.zeros((0, 0), np.float32)))
-    )
+    open_mixed = opener(layout_of(mixed_arrays((0, 0), 0)))
 
     @numba.njit
-    def total(address):
-        return open_mixed(address).numbers.sum()
+    def count(address):
+        return open_mixed(address).numbers.size
 
     for size in (0, 1, 1000):
-        mixed = Mixed(np.zeros((1, 1), np.bool_), np.ones(size), np.zeros((1, 1), np.float32))
-        address, table = address_of(mixed)
-        assert total(address) == size
-        assert table[3] == mixed.numbers.ctypes.data
+        handle = Handle(mixed_arrays((1, 1), size))
+        assert count(handle.address) == size
+
+
+Whole = namedtuple("Whole", "first scale second")
+
+
+def test_a_structure_may_hold_structures():
+    whole = Whole(mixed_arrays(), np.array([10.0]), mixed_arrays())
+    open_whole = opener(layout_of(whole))
+
+    @numba.njit
+    def add(mixed, amount):
+        mixed.numbers[:] += amount
+
+    @numba.njit
+    def work(address):
+        whole = open_whole(address)
+        add(whole.second, whole.scale[0])
+        whole.first.flags[1, 0] = True
+
+    handle = Handle(whole)
+    work(handle.address)
+    assert whole.first.numbers.tolist() == [0.0, 1.0, 2.0, 3.0]
+    assert whole.second.numbers.tolist() == [10.0, 11.0, 12.0, 13.0]
+    assert whole.first.flags.sum() == 1
+    other = mixed_arrays()
+    kept = Handle(other)
+    handle.point_at("second", kept)
+    work(handle.address)
+    assert other.numbers.tolist() == whole.second.numbers.tolist() == [10.0, 11.0, 12.0, 13.0]
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda handle: pickle.loads(pickle.dumps(handle))])
+def test_a_copy_of_a_handle_points_at_arrays_of_its_own(duplicate):
+    open_whole = opener(layout_of(Whole(mixed_arrays(), np.zeros(1), mixed_arrays())))
+
+    @numba.njit
+    def work(address):
+        open_whole(address).first.numbers[0] = 7.0
+
+    original = Handle(Whole(mixed_arrays(), np.zeros(1), mixed_arrays()))
+    twin = duplicate(original)
+    work(twin.address)
+    assert twin.structure.first.numbers[0] == 7.0
+    assert original.structure.first.numbers[0] == 0.0
+
+
+def test_a_copy_of_who_holds_structure_and_handle_holds_one_copy_of_the_arrays():
+    mixed = mixed_arrays()
+    holder = {"structure": mixed, "handle": Handle(mixed)}
+    twin = copy.deepcopy(holder)
+    assert twin["handle"].structure.numbers is twin["structure"].numbers is not mixed.numbers
 
 
 @pytest.mark.parametrize(
@@ -116,17 +160,17 @@ def test_one_function_serves_arrays_of_any_size():
 )
 def test_arrays_that_are_not_contiguous_are_refused(array):
     with pytest.raises(ValueError, match=r"Mixed\.numbers is not contiguous"):
-        table_of(Mixed(np.zeros((1, 1), np.bool_), array, np.zeros((1, 1), np.float32)))
+        Handle(Mixed(np.zeros((1, 1), np.bool_), array, np.zeros((1, 1), np.float32)))
 
 
 def test_an_attribute_that_is_no_array_does_not_compile():
-    mixed = Mixed(np.zeros((1, 1), np.bool_), np.zeros(1), np.zeros((1, 1), np.float32))
-    open_mixed = opener("Mixed", layout_of(mixed))
+    mixed = mixed_arrays()
+    open_mixed = opener(layout_of(mixed))
 
     @numba.njit
     def wrong(address):
         return open_mixed(address).letters
 
-    address, _ = address_of(mixed)
+    handle = Handle(mixed)
     with pytest.raises(TypingError, match="letters"):
-        wrong(address)
+        wrong(handle.address)

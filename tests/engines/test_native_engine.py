@@ -51,7 +51,7 @@ class Trial:
         self.engine = engine_of(grid_id, dispatch)
         self.state, self.grid = self.engine.state, self.engine.grid
         self.engine.begin(0, replace(calm_scenario(grid_id), **series), 0, STEPS - 1, NO_OUTAGES, None)
-        reset_one(self.engine.addresses, 0)
+        reset_one(self.engine.handle.address, 0)
         self.check()
 
     @property
@@ -274,7 +274,8 @@ def test_an_empty_busbar_changes_nothing(grid_id):
 
 
 def nbytes(engine: NativeEngine) -> int:
-    parts = (engine.arrays.state, engine.arrays.memory, engine.arrays.flow, engine.arrays.opponent)
+    environments = engine.environments
+    parts = (environments.state, environments.hidden, environments.flow, environments.opponent)
     return sum(array.nbytes for part in parts for array in part)
 
 

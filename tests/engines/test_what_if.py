@@ -68,7 +68,7 @@ def sample(grid_id: str, n: int, seed: int = 0) -> Any:
 
 def trips(engine: NativeEngine, rho: Any) -> bool:
     """Whether a protection opens a line in a next step with these loadings, as far as one can tell."""
-    exhausted = engine.arrays.memory.protection[0] >= engine.arrays.plant.overflow_allowed[0]
+    exhausted = engine.environments.hidden.protection[0] >= engine.environments.constants.overflow_allowed[0]
     return bool((rho > HARD_LIMIT).any() or (rho[exhausted] > 1 - LOADING_TOLERANCE).any())
 
 
@@ -204,10 +204,10 @@ def test_a_forecast_that_generators_cannot_follow_dooms_every_action(monkeypatch
 
 def test_looking_ahead_leaves_the_environment_as_it_was() -> None:
     engine = played("bus118-MOB-v1", 0)
-    before = [array.copy() for array in (*engine.state, *engine.arrays.memory, *engine.arrays.flow)]
+    before = [array.copy() for array in (*engine.state, *engine.environments.hidden, *engine.environments.flow)]
     what_if(engine, 0, full_catalogue(engine.grid), sample("bus118-MOB-v1", 10), Moment.NEXT_STEP)
     n_minus_1_score(engine, 0)
-    for old, new in zip(before, (*engine.state, *engine.arrays.memory, *engine.arrays.flow), strict=True):
+    for old, new in zip(before, (*engine.state, *engine.environments.hidden, *engine.environments.flow), strict=True):
         np.testing.assert_array_equal(old, new)
 
 

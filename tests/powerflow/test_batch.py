@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rl2grid.grids import GRID_IDS, Grid, load_grid
-from rl2grid.handles import table_of
+from rl2grid.handles import Handle
 from rl2grid.mdp.actions import full_catalogue, moved_elements
 from rl2grid.mdp.state import new_state
 from rl2grid.mdp.termination import GameOver, game_over_reason
@@ -19,7 +19,7 @@ from rl2grid.powerflow.batch import (
     MOVE,
     NOTHING,
     SWITCH,
-    Bench,
+    BatchSolver,
     Changes,
     Snapshot,
     new_outcomes,
@@ -41,7 +41,7 @@ class Case:
         self.grid: Grid = load_grid(grid_id)
         self.network = load_network(self.grid)
         self.snapshot = new_snapshot(self.grid)
-        self.bench = Bench(self.grid, self.network, new_wiring(self.grid, self.network), self.snapshot)
+        self.solver = BatchSolver(self.grid, self.network, new_wiring(self.grid, self.network), self.snapshot)
         self.flow = new_flow_state(self.network, 1)
         self.state = new_state(self.grid, 1)
         self.scenario = load_scenario(grid_id, list_scenarios(grid_id, "bundled")[0])
@@ -90,14 +90,14 @@ class Case:
         mask = np.concatenate((np.zeros(1 + grid.n_line, np.uint32), catalogue.mask[chosen]))
         return Changes(kind, target, mask)
 
-    def solve(self, snapshot: Snapshot, changes: Changes, order: Any = None) -> batch.Outcomes:
+    def solve(self, snapshot: Snapshot, changes: Changes, order: Any = None) -> batch.ChangeOutcomes:
         """All changes, or those of ``order``, in one call."""
         self.load(snapshot)
         n = len(changes.kind)
         outcomes = new_outcomes(n, np.full((n, self.grid.n_line), np.nan, np.float32))
         if order is None:
             order = np.lexsort((changes.target, changes.kind)).astype(np.int32)
-        self.bench.solve(table_of(changes), table_of(outcomes), order)
+        self.solver.solve(Handle(changes), Handle(outcomes), order)
         return outcomes
 
     def topology_after(self, snapshot: Snapshot, kind: int, target: int, mask: int) -> Any:
@@ -129,7 +129,7 @@ def case_of(grid_id: str) -> Case:
     return Case(grid_id)
 
 
-def assert_like_cold_flows(case: Case, snapshot: Snapshot, changes: Changes, outcomes: batch.Outcomes) -> None:
+def assert_like_cold_flows(case: Case, snapshot: Snapshot, changes: Changes, outcomes: batch.ChangeOutcomes) -> None:
     for k, change in enumerate(zip(*changes, strict=True)):
         reason, rho = case.solve_cold(snapshot, case.topology_after(snapshot, *map(int, change)))
         assert GameOver(outcomes.verdict[k]) == reason, change

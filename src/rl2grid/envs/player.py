@@ -221,7 +221,7 @@ class TaskPlayer:
         from rl2grid.envs.foresight import outages_after
 
         if self._solver is None:
-            self._solver = WhatIf(self.grid, engine.arrays.network)
+            self._solver = WhatIf(self.grid, engine.environments.network)
         return outages_after(engine, i, played, self._solver)
 
     def n_minus_1_score(self, i: int) -> float:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rl2grid.grids import Grid, load_grid
-from rl2grid.handles import Table, layout_of, opener, table_of
+from rl2grid.handles import Handle, layout_of, opener
 from rl2grid.powerflow.ac import (
     CONVERGED,
     DISCONNECTED,
@@ -64,7 +64,6 @@ from rl2grid.powerflow.model import Network, load_network
 from rl2grid.powerflow.newton import fill_jacobian
 from rl2grid.powerflow.paths import Paths, new_paths, write_path
 
-I64 = NDArray[np.int64]
 I8 = NDArray[np.int8]
 U32 = NDArray[np.uint32]
 Flags = NDArray[np.bool_]
@@ -77,7 +76,7 @@ _SETPOINT_TOLERANCE = 1e-7
 """Per unit, as in :mod:`rl2grid.powerflow.ac`."""
 _BASE: Any = np.int64(0)
 _ALONE: Any = np.int64(1)
-"""Rows of a task's flow: the base case; one change after another, solved cold."""
+"""Rows of a batch's flow: the base case; one change after another, solved cold."""
 
 
 class Snapshot(NamedTuple):
@@ -102,7 +101,7 @@ class Changes(NamedTuple):
     mask: U32  # [change] MOVE: bit k is the k-th element of the substation
 
 
-class Outcomes(NamedTuple):
+class ChangeOutcomes(NamedTuple):
     """The flow after each change; entry by entry."""
 
     worst_loading: F32  # [change] largest current over thermal limit; inf where there is no flow
@@ -121,8 +120,8 @@ class Scratch(NamedTuple):
     fed: I32  # [bus] 1 where a closed line ends
 
 
-class Task(NamedTuple):
-    """All that compiled code works with: handles (:mod:`rl2grid.handles`), which cost nothing to pass on."""
+class Batch(NamedTuple):
+    """All that compiled code works with, passed on as one handle (:mod:`rl2grid.handles`)."""
 
     network: Network
     wiring: Wiring
@@ -134,11 +133,11 @@ class Task(NamedTuple):
     scratch: Scratch
     snapshot: Snapshot
     changes: Changes
-    outcomes: Outcomes
+    outcomes: ChangeOutcomes
 
 
-class Bench:
-    """Workspace of one thread.
+class BatchSolver:
+    """Solves batches in one thread; keeps the workspace.
 
     Args:
         grid: the grid.
@@ -148,20 +147,19 @@ class Bench:
     """
 
     def __init__(self, grid: Grid, network: Network, wiring: Wiring, snapshot: Snapshot) -> None:
-        self._arrays = (*_new_workspace(grid, network, wiring), snapshot)
-        self._tables = [table_of(arrays) for arrays in self._arrays]
-        self._addresses = np.array([table.ctypes.data for table in self._tables] + [0, 0], np.int64)
+        self._handle = Handle(_new_batch(grid, network, wiring, snapshot))
 
-    def solve(self, changes: Table, outcomes: Table, order: I32) -> None:
+    def solve(self, changes: Handle[Changes], outcomes: Handle[ChangeOutcomes], order: I32) -> None:
         """Solve the flows after the changes ``order``; see :func:`solve_changes`.
 
         Args:
-            changes: table of :class:`Changes`.
-            outcomes: table of :class:`Outcomes`.
+            changes: the changes.
+            outcomes: where the outcomes are written.
             order: as there.
         """
-        self._addresses[-2:] = changes.ctypes.data, outcomes.ctypes.data
-        solve_changes(self._addresses, order)
+        self._handle.point_at("changes", changes)
+        self._handle.point_at("outcomes", outcomes)
+        solve_changes(self._handle.address, order)
 
 
 def new_snapshot(grid: Grid) -> Snapshot:
@@ -179,11 +177,11 @@ def new_snapshot(grid: Grid) -> Snapshot:
     )  # fmt: skip
 
 
-def _new_workspace(grid: Grid, network: Network, wiring: Wiring) -> tuple[Any, ...]:
-    """The first eight parts of a task."""
+def _new_batch(grid: Grid, network: Network, wiring: Wiring, snapshot: Snapshot) -> Batch:
+    """A batch without changes."""
     n_bus = 2 * grid.n_sub
     ints = np.int32
-    return (
+    return Batch(
         network,
         wiring,
         new_flow_state(network, 2),
@@ -197,12 +195,16 @@ def _new_workspace(grid: Grid, network: Network, wiring: Wiring) -> tuple[Any, .
             np.zeros(n_bus, ints),
             np.zeros(n_bus, ints),
         ),
+        snapshot,
+        Changes(np.zeros(0, np.int8), np.zeros(0, np.int32), np.zeros(0, np.uint32)),
+        new_outcomes(0, np.zeros((0, 0), np.float32)),
     )
 
 
-def new_outcomes(n: int, rho: F32) -> Outcomes:
+def new_outcomes(n: int, rho: F32) -> ChangeOutcomes:
     """Room for the outcomes of ``n`` changes; ``rho``, float32 [n, line] or [0, line], is written where it lies."""
-    return Outcomes(np.empty(n, np.float32), np.empty(n, np.int8), np.empty(n, np.int32), np.empty(n, np.bool_), rho)
+    worst_loading, verdict, overloads = np.empty(n, np.float32), np.empty(n, np.int8), np.empty(n, np.int32)
+    return ChangeOutcomes(worst_loading, verdict, overloads, np.empty(n, np.bool_), rho)
 
 
 def new_wiring(grid: Grid, network: Network) -> Wiring:
@@ -229,40 +231,20 @@ def new_wiring(grid: Grid, network: Network) -> Wiring:
 
 _GRID = load_grid("bus14")
 _NETWORK = load_network(_GRID)
-_EXAMPLE = _new_workspace(_GRID, _NETWORK, new_wiring(_GRID, _NETWORK))
+_open_batch = opener(layout_of(_new_batch(_GRID, _NETWORK, new_wiring(_GRID, _NETWORK), new_snapshot(_GRID))))
 """Layouts are the same for every grid: names, dtypes and axes."""
-_open_network, _open_wiring, _open_flow, _open_paths, _open_lane_flow, _open_site, _open_switches, _open_scratch = (
-    opener(type(arrays).__name__, layout_of(arrays)) for arrays in _EXAMPLE
-)
-_open_snapshot = opener("Snapshot", layout_of(new_snapshot(_GRID)))
-_open_changes = opener(
-    "Changes", layout_of(Changes(np.zeros(0, np.int8), np.zeros(0, np.int32), np.zeros(0, np.uint32)))
-)
-_open_outcomes = opener("Outcomes", layout_of(new_outcomes(0, np.zeros((0, 0), np.float32))))
 
 
 @borrowing_jit
-def solve_changes(addresses: I64, order: I32) -> None:
+def solve_changes(address: int, order: I32) -> None:
     """Solve the flows after some changes.
 
     Args:
-        addresses: int64 [11], of the tables of the parts of a :class:`Task`.
+        address: of the handle to a :class:`Batch`.
         order: int32 [k], which changes to solve; moves of one substation in a row. Only their outcomes are written.
     """
-    task = Task(
-        _open_network(addresses[0]),
-        _open_wiring(addresses[1]),
-        _open_flow(addresses[2]),
-        _open_paths(addresses[3]),
-        _open_lane_flow(addresses[4]),
-        _open_site(addresses[5]),
-        _open_switches(addresses[6]),
-        _open_scratch(addresses[7]),
-        _open_snapshot(addresses[8]),
-        _open_changes(addresses[9]),
-        _open_outcomes(addresses[10]),
-    )
-    network, flow, snapshot, changes = task.network, task.flow, task.snapshot, task.changes
+    batch = _open_batch(address)
+    network, flow, snapshot, changes = batch.network, batch.flow, batch.snapshot, batch.changes
     forget_flow(flow, _BASE)
     status = run_flow(
         network, flow, _BASE, snapshot.topo_vect, snapshot.gen_p, snapshot.gen_v, snapshot.load_p, snapshot.load_q,
@@ -270,7 +252,7 @@ def solve_changes(addresses: I64, order: I32) -> None:
     )  # fmt: skip
     if status != CONVERGED or not flow.known[_BASE]:
         for k in range(order.shape[0]):
-            _solve_alone(task, order[k])
+            _solve_alone(batch, order[k])
         return
     n_free = np.int64(flow.n_node[_BASE]) - 1
     first_unknown = flow.first_unknown[_BASE]
@@ -308,27 +290,28 @@ def solve_changes(addresses: I64, order: I32) -> None:
         while end < n and changes.kind[order[end]] == kind and (kind != MOVE or changes.target[order[end]] == target):
             end += 1
         if kind == NOTHING:
-            _repeat_base(task, order[begin:end])
+            _repeat_base(batch, order[begin:end])
         elif kind == SWITCH:
-            _solve_switches(task, equations, factors, order[begin:end])
+            _solve_switches(batch, equations, factors, order[begin:end])
         else:
-            _solve_moves(task, equations, factors, order[begin:end])
+            _solve_moves(batch, equations, factors, order[begin:end])
         begin = end
 
 
 @borrowing_jit
-def _repeat_base(task: Task, order: I32) -> None:
-    outcomes = task.outcomes
-    write_currents(task.network, task.flow, _BASE, task.scratch.current)
+def _repeat_base(batch: Batch, order: I32) -> None:
+    outcomes = batch.outcomes
+    write_currents(batch.network, batch.flow, _BASE, batch.scratch.current)
     for k in range(order.shape[0]):
         outcomes.cold[order[k]] = False
-        _write_solution(task, order[k])
+        _write_solution(batch, order[k])
 
 
 @borrowing_jit
-def _write_solution(task: Task, change: Index) -> None:
+def _write_solution(batch: Batch, change: Index) -> None:
     """The outcome that the currents in the scratch mean."""
-    outcomes, current, limit, rho = task.outcomes, task.scratch.current, task.wiring.thermal_limit, task.outcomes.rho
+    outcomes, rho = batch.outcomes, batch.outcomes.rho
+    current, limit = batch.scratch.current, batch.wiring.thermal_limit
     worst = np.float32(0.0)
     overloads = 0
     for line in range(limit.shape[0]):
@@ -343,8 +326,8 @@ def _write_solution(task: Task, change: Index) -> None:
 
 
 @borrowing_jit
-def _write_failure(task: Task, change: Index, verdict: int) -> None:
-    outcomes, rho = task.outcomes, task.outcomes.rho
+def _write_failure(batch: Batch, change: Index, verdict: int) -> None:
+    outcomes, rho = batch.outcomes, batch.outcomes.rho
     outcomes.worst_loading[change] = np.inf
     outcomes.overloads[change] = 0
     outcomes.verdict[change] = verdict
@@ -354,34 +337,34 @@ def _write_failure(task: Task, change: Index, verdict: int) -> None:
 
 
 @borrowing_jit
-def _solve_alone(task: Task, change: Index) -> None:
+def _solve_alone(batch: Batch, change: Index) -> None:
     """Solve one change by the cold recipe."""
-    network, flow, snapshot, scratch = task.network, task.flow, task.snapshot, task.scratch
-    _write_topology(task, change)
+    network, flow, snapshot, scratch = batch.network, batch.flow, batch.snapshot, batch.scratch
+    _write_topology(batch, change)
     forget_flow(flow, _ALONE)
     status = run_flow(
         network, flow, _ALONE, scratch.topo_vect, snapshot.gen_p, snapshot.gen_v, snapshot.load_p, snapshot.load_q,
         snapshot.storage_p,
     )  # fmt: skip
-    task.outcomes.cold[change] = True
+    batch.outcomes.cold[change] = True
     if status == CONVERGED:
         write_currents(network, flow, _ALONE, scratch.current)
-        _write_solution(task, change)
+        _write_solution(batch, change)
         return
     verdict = NO_SOLUTION
     if status == DISCONNECTED:
-        verdict = _why_disconnected(task)
-    _write_failure(task, change, verdict)
+        verdict = _why_disconnected(batch)
+    _write_failure(batch, change, verdict)
 
 
 @borrowing_jit
-def _write_topology(task: Task, change: Index) -> None:
-    network, snapshot, changes, topo_vect = task.network, task.snapshot, task.changes, task.scratch.topo_vect
+def _write_topology(batch: Batch, change: Index) -> None:
+    network, snapshot, changes, topo_vect = batch.network, batch.snapshot, batch.changes, batch.scratch.topo_vect
     kind, target = changes.kind[change], changes.target[change]
     for element in range(topo_vect.shape[0]):
         topo_vect[element] = snapshot.topo_vect[element]
     if kind == MOVE:
-        first = task.wiring.sub_first_element[target]
+        first = batch.wiring.sub_first_element[target]
         mask = changes.mask[change]
         k = 0
         while mask >> np.uint32(k) != 0:
@@ -406,10 +389,10 @@ def _bus(topo_vect: I32, position: Index, sub: Index, n_sub: Index) -> Index:
 
 
 @borrowing_jit
-def _why_disconnected(task: Task) -> int:
+def _why_disconnected(batch: Batch) -> int:
     """Reason, in the order of a game over's, why the topology in the scratch is in pieces."""
-    network, storage_p = task.network, task.snapshot.storage_p
-    topo_vect, parent, fed = task.scratch.topo_vect, task.scratch.parent, task.scratch.fed
+    network, storage_p = batch.network, batch.snapshot.storage_p
+    topo_vect, parent, fed = batch.scratch.topo_vect, batch.scratch.parent, batch.scratch.fed
     n_sub = network.nominal_voltage.shape[0]
     for every in range(parent.shape[0]):
         parent[every] = every
@@ -453,9 +436,9 @@ def _find(parent: I32, bus: Index) -> Index:
 
 
 @borrowing_jit
-def _solve_switches(task: Task, equations: Equations, factors: Factors, order: I32) -> None:
-    network, wiring, flow, changes = task.network, task.wiring, task.flow, task.changes
-    lane_flow, switches, paths = task.lane_flow, task.switches, task.paths
+def _solve_switches(batch: Batch, equations: Equations, factors: Factors, order: I32) -> None:
+    network, wiring, flow, changes = batch.network, batch.wiring, batch.flow, batch.changes
+    lane_flow, switches, paths = batch.lane_flow, batch.switches, batch.paths
     fill_jacobian(equations, factors)
     solvable = factorise(factors)
     if solvable:
@@ -477,28 +460,28 @@ def _solve_switches(task: Task, equations: Equations, factors: Factors, order: I
         if opens and not is_bridge(flow, _BASE, equations, switches, line):
             origin, extremity = np.int64(flow.line_or_node[_BASE, line]), np.int64(flow.line_ex_node[_BASE, line])
         if not opens:
-            origin, extremity = _ends_if_closed(task, line)
+            origin, extremity = _ends_if_closed(batch, line)
         if not solvable or origin < 0 or extremity < 0 or origin == extremity:
-            _solve_alone(task, change)
+            _solve_alone(batch, change)
             continue
         place_switch(network, flow, _BASE, equations, paths, lane_flow, switches, lane, line, origin, extremity, opens)
         lane_flow.action[lane] = change
         lane += 1
         if lane == WIDTH:
             solve_switches(network, wiring.limit, flow, _BASE, equations, factors, paths, lane_flow, switches)
-            _finish_lanes(task)
+            _finish_lanes(batch)
             lane = np.int64(0)
     if lane > 0:
         for idle in range(lane, WIDTH):
             lane_flow.state[idle] = EMPTY
         solve_switches(network, wiring.limit, flow, _BASE, equations, factors, paths, lane_flow, switches)
-        _finish_lanes(task)
+        _finish_lanes(batch)
 
 
 @borrowing_jit
-def _ends_if_closed(task: Task, line: Index) -> tuple[Index, Index]:
+def _ends_if_closed(batch: Batch, line: Index) -> tuple[Index, Index]:
     """Nodes that an open line joins when it is closed, -1 for a busbar without elements or a half-open line."""
-    network, flow, snapshot = task.network, task.flow, task.snapshot
+    network, flow, snapshot = batch.network, batch.flow, batch.snapshot
     n_sub = network.nominal_voltage.shape[0]
     origin, extremity = network.line_or_position[line], network.line_ex_position[line]
     if snapshot.topo_vect[origin] > 0 or snapshot.topo_vect[extremity] > 0:
@@ -514,9 +497,9 @@ def _ends_if_closed(task: Task, line: Index) -> tuple[Index, Index]:
 
 
 @borrowing_jit
-def _finish_lanes(task: Task) -> None:
+def _finish_lanes(batch: Batch) -> None:
     """Write what the lanes found; those that failed are solved alone."""
-    lane_flow, outcomes, rho = task.lane_flow, task.outcomes, task.outcomes.rho
+    lane_flow, outcomes, rho = batch.lane_flow, batch.outcomes, batch.outcomes.rho
     dismiss_distant_lanes(lane_flow)
     find_worst(lane_flow)
     loading = lane_flow.loading
@@ -525,7 +508,7 @@ def _finish_lanes(task: Task) -> None:
             continue
         change = lane_flow.action[lane]
         if lane_flow.state[lane] != DONE:
-            _solve_alone(task, change)
+            _solve_alone(batch, change)
             continue
         worst = np.float32(lane_flow.worst[0, lane])
         overloads = 0
@@ -542,9 +525,9 @@ def _finish_lanes(task: Task) -> None:
 
 
 @borrowing_jit
-def _solve_moves(task: Task, equations: Equations, factors: Factors, order: I32) -> None:
-    network, wiring, flow, changes, snapshot = task.network, task.wiring, task.flow, task.changes, task.snapshot
-    lane_flow, site, paths, outcomes = task.lane_flow, task.site, task.paths, task.outcomes
+def _solve_moves(batch: Batch, equations: Equations, factors: Factors, order: I32) -> None:
+    network, wiring, flow, changes, snapshot = batch.network, batch.wiring, batch.flow, batch.changes, batch.snapshot
+    lane_flow, site, paths, outcomes = batch.lane_flow, batch.site, batch.paths, batch.outcomes
     sub = changes.target[order[0]]
     solvable = open_site(
         network, wiring, flow, _BASE, equations, factors, paths, lane_flow, site, sub, snapshot.topo_vect,
@@ -554,13 +537,13 @@ def _solve_moves(task: Task, equations: Equations, factors: Factors, order: I32)
     for k in range(order.shape[0]):
         change = order[k]
         if not solvable:
-            _solve_alone(task, change)
+            _solve_alone(batch, change)
             continue
         second = (site.members[SECOND] ^ changes.mask[change]) & site.members[CONNECTED]
         verdict = _verdict_of_move(site, second)
         if verdict != SOLVED:
             outcomes.cold[change] = False
-            _write_failure(task, change, verdict)
+            _write_failure(batch, change, verdict)
             continue
         place_lane(wiring, site, lane, sub, second)
         lane_flow.state[lane] = RUNNING
@@ -568,13 +551,13 @@ def _solve_moves(task: Task, equations: Equations, factors: Factors, order: I32)
         lane += 1
         if lane == WIDTH:
             solve_moves(network, wiring, flow, _BASE, equations, factors, paths, lane_flow, site)
-            _finish_lanes(task)
+            _finish_lanes(batch)
             lane = np.int64(0)
     if lane > 0:
         for idle in range(lane, WIDTH):
             lane_flow.state[idle] = EMPTY
         solve_moves(network, wiring, flow, _BASE, equations, factors, paths, lane_flow, site)
-        _finish_lanes(task)
+        _finish_lanes(batch)
 
 
 @borrowing_jit

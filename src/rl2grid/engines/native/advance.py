@@ -9,29 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rl2grid.compile import jit
-from rl2grid.engines.native.entry import FLOW, MEMORY, NETWORK, OPPONENT, PLANT, STATE
-from rl2grid.engines.native.memory import Memory
-from rl2grid.engines.native.outcome import note_after, note_before, open_outcome
-from rl2grid.engines.native.plant import Plant
+from rl2grid.engines.native.action_notes import note_after, note_before
+from rl2grid.engines.native.environments import Environments, open_environments
 from rl2grid.engines.native.step import begin_step, dispatch_or_lose, finish_step, reset_row
-from rl2grid.engines.native.tables import (
-    Addresses,
-    open_flow,
-    open_memory,
-    open_network,
-    open_opponent,
-    open_plant,
-    open_state,
-)
 from rl2grid.mdp.accumulate import accrue, begin_episode, begin_transition
 from rl2grid.mdp.actions import ActionKind
 from rl2grid.mdp.features import write_redispatch_observation, write_topology_observation
 from rl2grid.mdp.heuristics import is_safe, reconnect_action, recovery_action
-from rl2grid.mdp.opponents import OpponentState
 from rl2grid.mdp.rewards import default_components, paper_components, released_components
 from rl2grid.mdp.state import F32, GridState
-from rl2grid.powerflow.ac import FlowState
-from rl2grid.powerflow.model import Network
 
 RESET = -1
 """In place of an :class:`~rl2grid.mdp.actions.ActionKind`: show the first row of the episode."""
@@ -49,8 +35,7 @@ Components = tuple[float, float, float]
 
 @jit
 def advance(
-    addresses: Addresses,
-    outcomes: int,
+    address: int,
     rows: NDArray[np.int64],
     kinds: NDArray[np.int64],
     targets: NDArray[np.int64],
@@ -64,8 +49,7 @@ def advance(
     """Play one transition in each of ``rows``.
 
     Args:
-        addresses: where the arrays lie.
-        outcomes: address of the table of the :class:`~rl2grid.engines.native.outcome.Outcome`.
+        address: of the handle to the :class:`~rl2grid.engines.native.environments.Environments`.
         rows: environments, int64 [k].
         kinds: what each agent does, an :class:`~rl2grid.mdp.actions.ActionKind` or :data:`RESET`, int64 [k].
         targets: lines or substations, int64 [k].
@@ -76,35 +60,27 @@ def advance(
         weights: of its components.
         gamma: discount between grid steps.
     """
-    plant, network = open_plant(addresses[PLANT]), open_network(addresses[NETWORK])
-    state, memory = open_state(addresses[STATE]), open_memory(addresses[MEMORY])
-    flow, opponent = open_flow(addresses[FLOW]), open_opponent(addresses[OPPONENT])
-    outcome = open_outcome(outcomes)
+    environments = open_environments(address)
+    state, notes = environments.state, environments.notes
     for k in range(rows.shape[0]):
         i = rows[k]
         illegal, ambiguous = False, False
         if kinds[k] == RESET:
-            reset_row(plant, network, state, memory, flow, i)
+            reset_row(environments, i)
             begin_episode(state, i)
         else:
             if state.decisions[i] > 0:
                 begin_transition(state, i)
             state.decisions[i] += 1
-            note_before(outcome, state, i, kinds[k], targets[k])
-            _step(
-                plant, network, state, memory, flow, opponent, i, kinds[k], targets[k], masks[k], values[k],
-                reward, weights, gamma,
-            )  # fmt: skip
-            note_after(outcome, state, i)
+            note_before(notes, state, i, kinds[k], targets[k])
+            _step(environments, i, kinds[k], targets[k], masks[k], values[k], reward, weights, gamma)
+            note_after(notes, state, i)
             illegal, ambiguous = state.illegal[i], state.ambiguous[i]
         if heuristic == ALONE:
             continue
         while not (state.terminated[i] or state.truncated[i]) and is_safe(state, i):
             kind, target = _heuristic_action(state, i, heuristic)
-            _step(
-                plant, network, state, memory, flow, opponent, i, kind, target, 0, values[k],
-                reward, weights, gamma,
-            )  # fmt: skip
+            _step(environments, i, kind, target, 0, values[k], reward, weights, gamma)
         state.illegal[i], state.ambiguous[i] = illegal, ambiguous
 
 
@@ -119,12 +95,7 @@ def _heuristic_action(state: GridState, i: int, heuristic: int) -> tuple[int, in
 
 @jit
 def _step(
-    plant: Plant,
-    network: Network,
-    state: GridState,
-    memory: Memory,
-    flow: FlowState,
-    opponent: OpponentState,
+    environments: Environments,
     i: int,
     kind: int,
     target: int,
@@ -135,9 +106,10 @@ def _step(
     gamma: float,
 ) -> None:
     """One grid step and what it is worth."""
-    needed = begin_step(plant, network, state, memory, i, kind, target, mask, values, True)
-    if not needed or dispatch_or_lose(state, memory, i):
-        finish_step(plant, network, state, memory, flow, opponent, i)
+    state = environments.state
+    needed = begin_step(environments, i, kind, target, mask, values, True)
+    if not needed or dispatch_or_lose(environments, i):
+        finish_step(environments, i)
     survive, overload, cost = _components(state, i, reward)
     accrue(state, i, survive, overload, cost, weights, gamma)
 
@@ -153,19 +125,19 @@ def _components(state: GridState, i: int, reward: int) -> Components:
 
 @jit
 def write_observations(
-    addresses: Addresses, rows: NDArray[np.int64], topology_task: bool, shift: F32, scale: F32, out: F32
+    address: int, rows: NDArray[np.int64], topology_task: bool, shift: F32, scale: F32, out: F32
 ) -> None:
     """Write the observations of ``rows`` to the same rows of ``out``, float32 [n, feature].
 
     Args:
-        addresses: where the arrays lie.
+        address: of the handle to the :class:`~rl2grid.engines.native.environments.Environments`.
         rows: environments, int64 [k].
         topology_task: which features are observed.
         shift: float32 [feature], subtracted.
         scale: float32 [feature], divided by after that.
         out: the observations.
     """
-    state = open_state(addresses[STATE])
+    state = open_environments(address).state
     for i in rows:
         if topology_task:
             write_topology_observation(state, i, out[i])

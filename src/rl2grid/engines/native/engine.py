@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from rl2grid.engines import DISPATCHES
 from rl2grid.engines.native.entry import (
-    FLOW,
     begin_one,
     begin_simulation_one,
     copy_flow_one,
@@ -21,11 +19,12 @@ from rl2grid.engines.native.entry import (
     set_generators_one,
     step_one,
 )
-from rl2grid.engines.native.memory import LOAD_P, LOAD_Q, PROD_P, PROD_V, Memory, new_memory
+from rl2grid.engines.native.environments import Environments, new_environments
+from rl2grid.engines.native.hidden_state import LOAD_P, LOAD_Q, PROD_P, PROD_V, HiddenState, new_hidden_state
 from rl2grid.engines.native.series import outages_of
-from rl2grid.engines.native.tables import Arrays, addresses_of, new_arrays
 from rl2grid.errors import UsageError, one_of
 from rl2grid.grids import Grid
+from rl2grid.handles import Handle
 from rl2grid.mdp.actions import DO_NOTHING, ActionKind, StepAction
 from rl2grid.mdp.opponents import OpponentDraws, draw_opponent, load_draws
 from rl2grid.mdp.state import F32, GridState
@@ -69,15 +68,13 @@ class NativeEngine:
         self._network = load_network(grid) if network is None else network
         self._attacks = opponent and grid.opponent.kind != "none"
         self._scenarios: list[Scenario | None] = [None] * n
-        self._use(new_arrays(grid, self._network, n, self._attacks))
-        self._simulated = new_arrays(grid, self._network, 1, opponent=False)
-        self._simulated_tables = self._simulated.tables()
-        self._simulated_addresses = addresses_of(self._simulated_tables)
+        self._use(new_environments(grid, self._network, n, self._attacks))
+        self._simulated = Handle(new_environments(grid, self._network, 1, opponent=False))
 
     def reset(self, i: int, plan: EpisodePlan) -> None:
         """Begin the episode ``plan`` in environment ``i``."""
         self.prepare(i, plan)
-        reset_one(self.addresses, i)
+        reset_one(self.handle.address, i)
 
     def prepare(self, i: int, plan: EpisodePlan) -> None:
         """Hand environment ``i`` the episode ``plan``; its first row is not shown yet."""
@@ -112,14 +109,14 @@ class NativeEngine:
         outages = outages - np.array([0, start, start], np.int32)
         outages = outages[outages[:, 2] > 0]
         self._make_room(len(outages))
-        memory, state = self.arrays.memory, self.state
-        memory.outage_line[i, : len(outages)] = outages[:, 0]
-        memory.outage_begin[i, : len(outages)] = outages[:, 1]
-        memory.outage_end[i, : len(outages)] = outages[:, 2]
-        memory.outage_count[i] = len(outages)
-        _point_at_series(memory, i, scenario, start)
+        hidden, state = self.environments.hidden, self.state
+        hidden.outage_line[i, : len(outages)] = outages[:, 0]
+        hidden.outage_begin[i, : len(outages)] = outages[:, 1]
+        hidden.outage_end[i, : len(outages)] = outages[:, 2]
+        hidden.outage_count[i] = len(outages)
+        _point_at_series(hidden, i, scenario, start)
         if draws is not None:
-            load_draws(self.arrays.opponent, i, draws)
+            load_draws(self.environments.opponent, i, draws)
         state.step[i] = 0
         state.episode_length[i] = n_steps
         state.decisions[i] = 0
@@ -131,55 +128,54 @@ class NativeEngine:
         """Play one grid step of environment ``i``."""
         command = _command(action)
         if self.dispatch == "exact":
-            step_one(self.addresses, i, *command)
+            step_one(self.handle.address, i, *command)
             return
-        if begin_one(self.addresses, i, *command, False) and not self._dispatch_like_grid2op(self.arrays, i):
-            lose_one(self.addresses, i)
+        if begin_one(self.handle.address, i, *command, False) and not self._dispatch_like_grid2op(self.environments, i):
+            lose_one(self.handle.address, i)
             return
-        finish_one(self.addresses, i)
+        finish_one(self.handle.address, i)
 
     def simulate(self, i: int, action: StepAction, horizon: int) -> GridState:
         """One step on the forecast; what it does is described in ``docs/simulate.md``."""
         if self._begin_simulation(i, action, horizon):
-            finish_simulation_one(self._simulated_addresses)
-        return self._simulated.state
+            finish_simulation_one(self._simulated.address)
+        return self._simulated.structure.state
 
-    def foresee(self, i: int, horizon: int) -> Arrays | None:
+    def foresee(self, i: int, horizon: int) -> Environments | None:
         """What :meth:`simulate` hands to the power flow when nobody acts.
 
         Returns:
-            Arrays whose row 0 holds topology, cooldowns and injections, until the next call or simulation; None if
-            the generators cannot follow the forecast.
+            Environments whose row 0 holds topology, cooldowns and injections, until the next call or simulation; None
+            if the generators cannot follow the forecast.
 
         Raises:
             UsageError: after a game over, or without such a forecast.
         """
         if not self._begin_simulation(i, DO_NOTHING, horizon):
             return None
-        set_generators_one(self._simulated_addresses, 0)
-        return self._simulated
+        set_generators_one(self._simulated.address, 0)
+        return self._simulated.structure
 
     def close(self) -> None:
         """Let go of the series."""
         self._scenarios = [None] * len(self._scenarios)
 
-    def _use(self, arrays: Arrays) -> None:
-        self.arrays = arrays
-        self.state = arrays.state
-        self._tables = arrays.tables()
-        self.addresses = addresses_of(self._tables)
+    def _use(self, environments: Environments) -> None:
+        self.environments = environments
+        self.state = environments.state
+        self.handle = Handle(environments)
 
     def _make_room(self, outages: int) -> None:
-        """Grow the memory to hold that many planned outages per environment."""
-        memory = self.arrays.memory
-        n, room = memory.outage_line.shape
+        """Grow the arrays to hold that many planned outages per environment."""
+        hidden = self.environments.hidden
+        n, room = hidden.outage_line.shape
         if outages <= room:
             return
-        larger = new_memory(self.grid, n, max(outages, 2 * room))
+        larger = new_hidden_state(self.grid, n, max(outages, 2 * room))
         for name in ("outage_line", "outage_begin", "outage_end"):
-            getattr(larger, name)[:, :room] = getattr(memory, name)
+            getattr(larger, name)[:, :room] = getattr(hidden, name)
         grown = {name: getattr(larger, name) for name in ("outage_line", "outage_begin", "outage_end")}
-        self._use(replace(self.arrays, memory=memory._replace(**grown)))
+        self._use(self.environments._replace(hidden=hidden._replace(**grown)))
 
     def _begin_simulation(self, i: int, action: StepAction, horizon: int) -> bool:
         """Play a step on the forecast up to the setting of the generators; False if they cannot be dispatched."""
@@ -189,45 +185,45 @@ class NativeEngine:
         if scenario.load_p_forecast is None or horizon > scenario.load_p_forecast.shape[1]:
             raise UsageError(f"Scenario {scenario.id!r} has no forecast {horizon} steps ahead.")
         self._copy_row(i)
-        exact, addresses = self.dispatch == "exact", self._simulated_addresses
-        needed = begin_simulation_one(addresses, self.addresses, i, *_command(action), horizon, exact)
+        exact, simulated, real = self.dispatch == "exact", self._simulated.address, self.handle.address
+        needed = begin_simulation_one(simulated, real, i, *_command(action), horizon, exact)
         return not needed or self._find_simulated_dispatch()
 
     def _copy_row(self, i: int) -> None:
         """Bring the simulated environment to where environment ``i`` is."""
-        source, target = self.arrays, self._simulated
+        source, target = self.environments, self._simulated.structure
         for name in GridState._fields[_FIRST_DYNAMIC:]:
             getattr(target.state, name)[0] = getattr(source.state, name)[i]
-        for name in Memory._fields[: Memory._fields.index("new_p")]:
-            getattr(target.memory, name)[0] = getattr(source.memory, name)[i]
+        for name in HiddenState._fields[: HiddenState._fields.index("new_p")]:
+            getattr(target.hidden, name)[0] = getattr(source.hidden, name)[i]
         target.state.truncated[0] = False
-        copy_flow_one(self.addresses[FLOW], i, self._simulated_addresses[FLOW], 0)
+        copy_flow_one(self.handle.address, i, self._simulated.address, 0)
 
     def _find_simulated_dispatch(self) -> bool:
         """Dispatch the simulated environment, or end its episode."""
         if self.dispatch == "exact":
-            return dispatch_one(self._simulated_addresses, 0)
-        if self._dispatch_like_grid2op(self._simulated, 0):
+            return dispatch_one(self._simulated.address, 0)
+        if self._dispatch_like_grid2op(self._simulated.structure, 0):
             return True
-        lose_one(self._simulated_addresses, 0)
+        lose_one(self._simulated.address, 0)
         return False
 
-    def _dispatch_like_grid2op(self, arrays: Arrays, i: int) -> bool:
+    def _dispatch_like_grid2op(self, environments: Environments, i: int) -> bool:
         from rl2grid.engines.grid2op_dispatch import find_dispatch_grid2op
 
-        state, memory, grid = arrays.state, arrays.memory, self.grid
+        state, hidden, grid = environments.state, environments.hidden, self.grid
         return find_dispatch_grid2op(
-            memory.new_p[i],
-            memory.setpoint[i],
+            hidden.new_p[i],
+            hidden.setpoint[i],
             state.target_dispatch[i],
             state.actual_dispatch[i],
-            memory.modified[i],
+            hidden.modified[i],
             grid.gen_pmin,
             grid.gen_pmax,
             grid.gen_max_ramp_up,
             grid.gen_max_ramp_down,
             grid.gen_redispatchable,
-            float(memory.storage_change[i]) - float(memory.curtailment_change[i]),
+            float(hidden.storage_change[i]) - float(hidden.curtailment_change[i]),
             state.actual_dispatch[i],
         )
 
@@ -241,12 +237,12 @@ def _command(action: StepAction) -> tuple[int, int, int, F32]:
     return action.kind, action.target, action.mask, values
 
 
-def _point_at_series(memory: Memory, i: int, scenario: Scenario, start: int) -> None:
+def _point_at_series(hidden: HiddenState, i: int, scenario: Scenario, start: int) -> None:
     series = ((LOAD_P, "load_p"), (LOAD_Q, "load_q"), (PROD_P, "prod_p"), (PROD_V, "prod_v"))
     for column, name in series:
-        memory.series[i, column] = _address(getattr(scenario, name), start)
-        memory.forecast[i, column] = _address(getattr(scenario, f"{name}_forecast"), start)
-    memory.horizons[i] = 0 if scenario.load_p_forecast is None else scenario.load_p_forecast.shape[1]
+        hidden.series[i, column] = _address(getattr(scenario, name), start)
+        hidden.forecast[i, column] = _address(getattr(scenario, f"{name}_forecast"), start)
+    hidden.horizons[i] = 0 if scenario.load_p_forecast is None else scenario.load_p_forecast.shape[1]
 
 
 def _address(array: F32 | None, row: int) -> int:

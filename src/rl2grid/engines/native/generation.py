@@ -16,8 +16,8 @@ from rl2grid.engines.dispatch import (
     redispatch_is_impossible,
     rounded_sum,
 )
-from rl2grid.engines.native.memory import Memory
-from rl2grid.engines.native.plant import INITIAL_CHARGE, Plant
+from rl2grid.engines.native.constants import INITIAL_CHARGE
+from rl2grid.engines.native.environments import Environments
 from rl2grid.mdp.state import F32, GridState
 
 _FULL = np.float32(1.0)
@@ -25,112 +25,119 @@ _NONE = np.float32(0.0)
 
 
 @jit
-def begin_generation(plant: Plant, state: GridState, memory: Memory, i: int) -> None:
+def begin_generation(environments: Environments, i: int) -> None:
     """Dispatch, limits and charge of row ``i`` as a reset finds them."""
+    constants, state = environments.constants, environments.state
     state.target_dispatch[i] = 0.0
     state.actual_dispatch[i] = 0.0
     state.curtailment_limit[i] = 1.0
     state.gen_p_before_curtail[i] = 0.0
     state.storage_power[i] = 0.0
     state.storage_power_target[i] = 0.0
-    for unit in range(plant.storage_emax.shape[0]):
-        lost = plant.storage_loss[unit] * plant.hours_per_step[0]
-        state.storage_charge[i, unit] = INITIAL_CHARGE * plant.storage_emax[unit] + lost
+    for unit in range(constants.storage_emax.shape[0]):
+        lost = constants.storage_loss[unit] * constants.hours_per_step[0]
+        state.storage_charge[i, unit] = INITIAL_CHARGE * constants.storage_emax[unit] + lost
 
 
 @jit
-def decode_injection(plant: Plant, state: GridState, memory: Memory, i: int, values: F32) -> None:
+def decode_injection(environments: Environments, i: int, values: F32) -> None:
     """Write what a continuous action asks for: redispatch, curtailment limits, storage.
 
     :func:`rl2grid.mdp.actions.decode_continuous`, compiled; limits go into effect at once.
     """
+    constants, state, hidden = environments.constants, environments.state, environments.hidden
     entry = 0
-    for gen in plant.redispatch_gen:
+    for gen in constants.redispatch_gen:
         ramp = state.gen_max_ramp_up[gen] if values[entry] > 0 else state.gen_max_ramp_down[gen]
-        memory.request[i, gen] = values[entry] * ramp
+        hidden.request[i, gen] = values[entry] * ramp
         entry += 1
-    for gen in plant.curtail_gen:
+    for gen in constants.curtail_gen:
         state.curtailment_limit[i, gen] = _FULL + min(values[entry], _NONE)
         entry += 1
-    for unit in range(plant.storage_emax.shape[0]):
-        most = plant.storage_max_p_absorb[unit] if values[entry] > 0 else plant.storage_max_p_prod[unit]
-        memory.storage_request[i, unit] = values[entry] * most
+    for unit in range(constants.storage_emax.shape[0]):
+        most = constants.storage_max_p_absorb[unit] if values[entry] > 0 else constants.storage_max_p_prod[unit]
+        hidden.storage_request[i, unit] = values[entry] * most
         entry += 1
 
 
 @jit
-def request_is_impossible(plant: Plant, state: GridState, memory: Memory, i: int, values: F32) -> bool:
+def request_is_impossible(environments: Environments, i: int, values: F32) -> bool:
     """Whether the redispatch of a continuous action can never be carried out; writes ``request``."""
-    memory.request[i] = 0.0
-    for entry in range(plant.redispatch_gen.shape[0]):
-        gen = plant.redispatch_gen[entry]
+    constants, state, hidden = environments.constants, environments.state, environments.hidden
+    hidden.request[i] = 0.0
+    for entry in range(constants.redispatch_gen.shape[0]):
+        gen = constants.redispatch_gen[entry]
         ramp = state.gen_max_ramp_up[gen] if values[entry] > 0 else state.gen_max_ramp_down[gen]
-        memory.request[i, gen] = values[entry] * ramp
+        hidden.request[i, gen] = values[entry] * ramp
     return redispatch_is_impossible(
-        memory.request[i],
+        hidden.request[i],
         state.target_dispatch[i],
         state.actual_dispatch[i],
-        memory.modified[i],
+        hidden.modified[i],
         state.gen_pmin,
         state.gen_pmax,
     )
 
 
 @jit
-def use_storage(plant: Plant, state: GridState, memory: Memory, i: int) -> None:
+def use_storage(environments: Environments, i: int) -> None:
     """Charge and discharge as asked for in ``storage_request``, within what the units hold."""
-    hours = plant.hours_per_step[0]
-    memory.charge_before[i] = state.storage_charge[i]
+    constants, state, hidden = environments.constants, environments.state, environments.hidden
+    hours = constants.hours_per_step[0]
+    hidden.charge_before[i] = state.storage_charge[i]
     in_use = False
-    for unit in range(plant.storage_emax.shape[0]):
-        power = memory.storage_request[i, unit]
+    for unit in range(constants.storage_emax.shape[0]):
+        power = hidden.storage_request[i, unit]
         state.storage_power_target[i, unit] = 0.0
         state.storage_power[i, unit] = 0.0
         if abs(power) < NEGLIGIBLE:
             continue
         in_use = True
         # Grid2Op multiplies by a double-precision efficiency here.
-        efficiency = np.float64(plant.storage_charging_efficiency[unit])
+        efficiency = np.float64(constants.storage_charging_efficiency[unit])
         if power < 0:
-            efficiency = 1.0 / np.float64(plant.storage_discharging_efficiency[unit])
+            efficiency = 1.0 / np.float64(constants.storage_discharging_efficiency[unit])
         energy = np.float64(power * hours) * efficiency
         state.storage_charge[i, unit] = np.float32(np.float64(state.storage_charge[i, unit]) + energy)
         state.storage_power_target[i, unit] = power
         state.storage_power[i, unit] = power
     if in_use:
-        for unit in range(plant.storage_emax.shape[0]):
-            _keep_within_capacity(plant, state, i, unit)
-    absorbed = rounded_sum(state.storage_power[i], plant.storage_emax.shape[0]) if in_use else _NONE
-    memory.storage_change[i] = absorbed - memory.stored[i]
-    memory.stored[i] = absorbed
-    lose_charge(plant, state, i)
+        for unit in range(constants.storage_emax.shape[0]):
+            _keep_within_capacity(environments, i, unit)
+    absorbed = rounded_sum(state.storage_power[i], constants.storage_emax.shape[0]) if in_use else _NONE
+    hidden.storage_change[i] = absorbed - hidden.stored[i]
+    hidden.stored[i] = absorbed
+    lose_charge(environments, i)
 
 
 @jit
-def _keep_within_capacity(plant: Plant, state: GridState, i: int, unit: int) -> None:
-    per_hour = _FULL / plant.hours_per_step[0]
-    too_much = state.storage_charge[i, unit] - plant.storage_emax[unit]
+def _keep_within_capacity(environments: Environments, i: int, unit: int) -> None:
+    constants, state = environments.constants, environments.state
+    per_hour = _FULL / constants.hours_per_step[0]
+    too_much = state.storage_charge[i, unit] - constants.storage_emax[unit]
     if too_much > 0:
-        state.storage_power[i, unit] -= per_hour * too_much / plant.storage_charging_efficiency[unit]
-        state.storage_charge[i, unit] = plant.storage_emax[unit]
-    too_little = state.storage_charge[i, unit] - plant.storage_emin[unit]
+        state.storage_power[i, unit] -= per_hour * too_much / constants.storage_charging_efficiency[unit]
+        state.storage_charge[i, unit] = constants.storage_emax[unit]
+    too_little = state.storage_charge[i, unit] - constants.storage_emin[unit]
     if too_little < 0:
-        state.storage_power[i, unit] -= per_hour * too_little * plant.storage_discharging_efficiency[unit]
-        state.storage_charge[i, unit] = plant.storage_emin[unit]
+        state.storage_power[i, unit] -= per_hour * too_little * constants.storage_discharging_efficiency[unit]
+        state.storage_charge[i, unit] = constants.storage_emin[unit]
 
 
 @jit
-def lose_charge(plant: Plant, state: GridState, i: int) -> None:
+def lose_charge(environments: Environments, i: int) -> None:
     """Withdraw what storage units lose in a step."""
-    for unit in range(plant.storage_emax.shape[0]):
-        left = state.storage_charge[i, unit] - plant.storage_loss[unit] * plant.hours_per_step[0]
+    constants, state = environments.constants, environments.state
+    for unit in range(constants.storage_emax.shape[0]):
+        left = state.storage_charge[i, unit] - constants.storage_loss[unit] * constants.hours_per_step[0]
         state.storage_charge[i, unit] = max(left, _NONE)
 
 
 @jit
-def curtail(plant: Plant, state: GridState, memory: Memory, i: int) -> None:
+def curtail(environments: Environments, i: int) -> None:
     """Hold renewables to their limits: lowers ``new_p``, notes the change of the curtailed power."""
-    new_p, before = memory.new_p[i], state.gen_p_before_curtail[i]
+    state, hidden = environments.state, environments.hidden
+    new_p, before = hidden.new_p[i], state.gen_p_before_curtail[i]
     limited = np.empty((2, new_p.shape[0]), np.float32)
     count = 0
     for gen in range(new_p.shape[0]):
@@ -145,14 +152,15 @@ def curtail(plant: Plant, state: GridState, memory: Memory, i: int) -> None:
         limited[1, count] = before[gen]
         count += 1
     curtailed = rounded_sum(limited[0], count) - rounded_sum(limited[1], count)
-    memory.curtailment_change[i] = curtailed - memory.curtailed[i]
-    memory.curtailed[i] = curtailed
+    hidden.curtailment_change[i] = curtailed - hidden.curtailed[i]
+    hidden.curtailed[i] = curtailed
 
 
 @jit
-def request_redispatch(state: GridState, memory: Memory, i: int) -> None:
+def request_redispatch(environments: Environments, i: int) -> None:
     """Add the redispatch asked for in ``request`` to the targets."""
-    add_request(memory.request[i], state.target_dispatch[i], state.actual_dispatch[i], memory.modified[i])
+    state, hidden = environments.state, environments.hidden
+    add_request(hidden.request[i], state.target_dispatch[i], state.actual_dispatch[i], hidden.modified[i])
 
 
 @jit
@@ -166,38 +174,41 @@ def target_is_out_of_reach(state: GridState, i: int) -> bool:
 
 
 @jit
-def take_back_request(plant: Plant, state: GridState, memory: Memory, i: int) -> None:
+def take_back_request(environments: Environments, i: int) -> None:
     """What Grid2Op does about an impossible redispatch: the targets are restored, and storage goes wrong.
 
     Its charge is restored while its power still flows, and the balance counts it anew.
     """
+    constants, state, hidden = environments.constants, environments.state, environments.hidden
     for gen in range(state.gen_pmax.shape[0]):
-        state.target_dispatch[i, gen] -= memory.request[i, gen]
-    if plant.storage_emax.shape[0] == 0:
+        state.target_dispatch[i, gen] -= hidden.request[i, gen]
+    if constants.storage_emax.shape[0] == 0:
         return
-    state.storage_charge[i] = memory.charge_before[i]
-    memory.storage_change[i] -= memory.stored[i]
-    lose_charge(plant, state, i)
+    state.storage_charge[i] = hidden.charge_before[i]
+    hidden.storage_change[i] -= hidden.stored[i]
+    lose_charge(environments, i)
 
 
 @jit
-def needs_dispatch(state: GridState, memory: Memory, i: int) -> bool:
+def needs_dispatch(environments: Environments, i: int) -> bool:
     """Whether the generators have to be dispatched in this step."""
+    state, hidden = environments.state, environments.hidden
     return dispatch_is_needed(
-        state.actual_dispatch[i], state.target_dispatch[i], memory.storage_change[i], memory.curtailment_change[i]
+        state.actual_dispatch[i], state.target_dispatch[i], hidden.storage_change[i], hidden.curtailment_change[i]
     )
 
 
 @jit
-def dispatch(state: GridState, memory: Memory, i: int) -> bool:
+def dispatch(environments: Environments, i: int) -> bool:
     """Find the exact dispatch; False, a game over, if there is none."""
-    power = np.float64(memory.storage_change[i]) - np.float64(memory.curtailment_change[i])
+    state, hidden = environments.state, environments.hidden
+    power = np.float64(hidden.storage_change[i]) - np.float64(hidden.curtailment_change[i])
     return find_dispatch(
-        memory.new_p[i],
-        memory.setpoint[i],
+        hidden.new_p[i],
+        hidden.setpoint[i],
         state.target_dispatch[i],
         state.actual_dispatch[i],
-        memory.modified[i],
+        hidden.modified[i],
         state.gen_pmin,
         state.gen_pmax,
         state.gen_max_ramp_up,
@@ -209,10 +220,11 @@ def dispatch(state: GridState, memory: Memory, i: int) -> bool:
 
 
 @jit
-def set_generators(state: GridState, memory: Memory, i: int) -> None:
+def set_generators(environments: Environments, i: int) -> None:
     """The production that the generators are set to: the series' plus the dispatch."""
-    for gen in range(memory.new_p.shape[1]):
+    state, hidden = environments.state, environments.hidden
+    for gen in range(hidden.new_p.shape[1]):
         dispatched = state.actual_dispatch[i, gen]
-        memory.gen_p[i, gen] = memory.new_p[i, gen]
+        hidden.gen_p[i, gen] = hidden.new_p[i, gen]
         if abs(dispatched) >= NEGLIGIBLE:
-            memory.gen_p[i, gen] += dispatched
+            hidden.gen_p[i, gen] += dispatched

@@ -5,19 +5,19 @@ from __future__ import annotations
 import numpy as np
 
 from rl2grid.compile import jit
-from rl2grid.engines.native.memory import Memory
+from rl2grid.engines.native.environments import Environments
 from rl2grid.mdp.state import GridState
-from rl2grid.powerflow.ac import FlowState, write_flow
-from rl2grid.powerflow.model import Network
+from rl2grid.powerflow.ac import write_flow
 
 _NONE = np.float32(0.0)
 
 
 @jit
-def observe(network: Network, state: GridState, memory: Memory, flow: FlowState, i: int) -> None:
+def observe(environments: Environments, i: int) -> None:
     """Write what row ``i`` shows of a converged flow; ``a_or`` and everything that a step counts are there."""
-    state.gen_p[i] = memory.gen_p[i]
-    state.load_p[i] = memory.load_p[i]
+    network, state, hidden, flow = environments.network, environments.state, environments.hidden, environments.flow
+    state.gen_p[i] = hidden.gen_p[i]
+    state.load_p[i] = hidden.load_p[i]
     write_flow(
         network,
         flow,

@@ -14,9 +14,9 @@ from numba.core.extending import intrinsic
 from numpy.typing import NDArray
 
 from rl2grid.compile import jit
-from rl2grid.engines.native.memory import LOAD_P, LOAD_Q, PROD_P, PROD_V, Memory
-from rl2grid.mdp.state import F32, GridState
-from rl2grid.powerflow.model import Network
+from rl2grid.engines.native.environments import Environments
+from rl2grid.engines.native.hidden_state import LOAD_P, LOAD_Q, PROD_P, PROD_V, HiddenState
+from rl2grid.mdp.state import F32
 
 
 @intrinsic  # type: ignore[untyped-decorator]
@@ -31,41 +31,44 @@ def _float32_at(typing_context: Any, address: Any, index: Any) -> Any:
 
 
 @jit
-def read_row(memory: Memory, network: Network, i: int, step: int) -> None:
+def read_row(environments: Environments, i: int, step: int) -> None:
     """Read what the series says of step ``step`` of row ``i``: demand, production, voltages."""
-    _copy(memory.series[i, LOAD_P], step, memory.load_p[i])
-    _copy(memory.series[i, LOAD_Q], step, memory.load_q[i])
-    _copy(memory.series[i, PROD_P], step, memory.new_p[i])
-    _read_voltages(memory.series[i, PROD_V], step, memory, network, i)
+    hidden = environments.hidden
+    _copy(hidden.series[i, LOAD_P], step, hidden.load_p[i])
+    _copy(hidden.series[i, LOAD_Q], step, hidden.load_q[i])
+    _copy(hidden.series[i, PROD_P], step, hidden.new_p[i])
+    _read_voltages(hidden.series[i, PROD_V], step, environments, i)
 
 
 @jit
-def read_forecast(memory: Memory, network: Network, i: int, source: Memory, row: int, step: int, horizon: int) -> None:
+def read_forecast(environments: Environments, i: int, source: HiddenState, row: int, step: int, horizon: int) -> None:
     """Read into row ``i`` what row ``row`` of ``source`` forecasts at ``step`` for ``horizon`` steps later.
 
     Without forecast set-points the measured voltages are kept, as Grid2Op does.
     """
+    network, hidden = environments.network, environments.hidden
     place = np.int64(step) * source.horizons[row] + horizon - 1
-    _copy(source.forecast[row, LOAD_P], place, memory.load_p[i])
-    _copy(source.forecast[row, LOAD_Q], place, memory.load_q[i])
-    _copy(source.forecast[row, PROD_P], place, memory.new_p[i])
+    _copy(source.forecast[row, LOAD_P], place, hidden.load_p[i])
+    _copy(source.forecast[row, LOAD_Q], place, hidden.load_q[i])
+    _copy(source.forecast[row, PROD_P], place, hidden.new_p[i])
     if source.forecast[row, PROD_V] != 0:
-        _read_voltages(source.forecast[row, PROD_V], place, memory, network, i)
+        _read_voltages(source.forecast[row, PROD_V], place, environments, i)
         return
-    for gen in range(memory.gen_v.shape[1]):
+    for gen in range(hidden.gen_v.shape[1]):
         measured = np.float32(source.gen_v[row, gen] * network.nominal_voltage[network.gen_sub[gen]])
-        memory.gen_v[i, gen] = measured / network.gen_kilovolt[gen]
+        hidden.gen_v[i, gen] = measured / network.gen_kilovolt[gen]
 
 
 @jit
-def _read_voltages(address: int, row: int, memory: Memory, network: Network, i: int) -> None:
-    n_gen = memory.gen_v.shape[1]
+def _read_voltages(address: int, row: int, environments: Environments, i: int) -> None:
+    network, hidden = environments.network, environments.hidden
+    n_gen = hidden.gen_v.shape[1]
     for gen in range(n_gen):
         if address == 0:
-            memory.gen_v[i, gen] = network.gen_setpoint[gen]
+            hidden.gen_v[i, gen] = network.gen_setpoint[gen]
         else:
             # Grid2Op divides in single precision.
-            memory.gen_v[i, gen] = _value(address, row * n_gen + gen) / network.gen_kilovolt[gen]
+            hidden.gen_v[i, gen] = _value(address, row * n_gen + gen) / network.gen_kilovolt[gen]
 
 
 @jit
@@ -81,32 +84,33 @@ def _value(address: int, index: int) -> np.float32:
 
 
 @jit
-def begin_outages(memory: Memory, i: int) -> None:
+def begin_outages(hidden: HiddenState, i: int) -> None:
     """Point every line of row ``i`` at its first planned outage."""
-    memory.next_outage[i] = -1
-    for k in range(memory.outage_count[i] - 1, -1, -1):
-        memory.next_outage[i, memory.outage_line[i, k]] = k
+    hidden.next_outage[i] = -1
+    for k in range(hidden.outage_count[i] - 1, -1, -1):
+        hidden.next_outage[i, hidden.outage_line[i, k]] = k
 
 
 @jit
-def plan_outages(memory: Memory, state: GridState, i: int, step: int) -> None:
+def plan_outages(environments: Environments, i: int, step: int) -> None:
     """Write when the next outage of each line begins at ``step`` and how long it lasts.
 
     The rows of :func:`rl2grid.scenarios.maintenance.maintenance_times`, one after the other.
     """
-    for line in range(memory.next_outage.shape[1]):
-        k = memory.next_outage[i, line]
-        if k >= 0 and memory.outage_end[i, k] <= step:
-            following = k + 1 < memory.outage_count[i] and memory.outage_line[i, k + 1] == line
+    state, hidden = environments.state, environments.hidden
+    for line in range(hidden.next_outage.shape[1]):
+        k = hidden.next_outage[i, line]
+        if k >= 0 and hidden.outage_end[i, k] <= step:
+            following = k + 1 < hidden.outage_count[i] and hidden.outage_line[i, k + 1] == line
             k = k + 1 if following else -1
-            memory.next_outage[i, line] = k
+            hidden.next_outage[i, line] = k
         if k < 0:
             state.time_next_maintenance[i, line] = -1
             state.duration_next_maintenance[i, line] = 0
             continue
-        begin = memory.outage_begin[i, k]
+        begin = hidden.outage_begin[i, k]
         state.time_next_maintenance[i, line] = max(begin - step, 0)
-        state.duration_next_maintenance[i, line] = memory.outage_end[i, k] - max(begin, step)
+        state.duration_next_maintenance[i, line] = hidden.outage_end[i, k] - max(begin, step)
 
 
 def outages_of(matrix: NDArray[np.bool_]) -> NDArray[np.int32]:

@@ -8,6 +8,7 @@
 from __future__ import annotations
 
 from rl2grid.compile import jit
+from rl2grid.engines.native.environments import Environments
 from rl2grid.engines.native.generation import (
     begin_generation,
     curtail,
@@ -21,72 +22,59 @@ from rl2grid.engines.native.generation import (
     target_is_out_of_reach,
     use_storage,
 )
-from rl2grid.engines.native.memory import Memory, begin_memory
+from rl2grid.engines.native.hidden_state import HiddenState, begin_hidden_state
 from rl2grid.engines.native.observation import blank_row, observe
-from rl2grid.engines.native.plant import Plant
 from rl2grid.engines.native.protections import flow_with_cascade
 from rl2grid.engines.native.series import begin_outages, plan_outages, read_row
 from rl2grid.engines.native.topology import act_on_topology, open_line, remember_busbars
 from rl2grid.mdp.actions import ActionKind
-from rl2grid.mdp.opponents import OpponentState, opponent_step
+from rl2grid.mdp.opponents import opponent_step
 from rl2grid.mdp.state import F32, GridState
 from rl2grid.mdp.termination import GameOver, game_over_reason
-from rl2grid.powerflow.ac import FlowState, forget_flow
-from rl2grid.powerflow.model import Network
+from rl2grid.powerflow.ac import forget_flow
 
 _INJECTION = int(ActionKind.INJECTION)
 _DISPATCH = int(GameOver.DISPATCH)
 
 
 @jit
-def reset_row(plant: Plant, network: Network, state: GridState, memory: Memory, flow: FlowState, i: int) -> None:
+def reset_row(environments: Environments, i: int) -> None:
     """Show the first row of the series of environment ``i``.
 
     Grid2Op plays a step for that: nobody acts, overloads are not counted, but lines above the hard limit trip.
     """
-    begin_memory(memory, i)
-    begin_generation(plant, state, memory, i)
-    begin_outages(memory, i)
+    state, hidden, flow = environments.state, environments.hidden, environments.flow
+    begin_hidden_state(hidden, i)
+    begin_generation(environments, i)
+    begin_outages(hidden, i)
     forget_flow(flow, i)
     state.topo_vect[i] = 1
     state.time_before_cooldown_line[i] = 0
     state.time_before_cooldown_sub[i] = 0
     state.timestep_overflow[i] = 0
-    _nobody_acts(memory, i)
-    read_row(memory, network, i, 0)
-    plan_outages(memory, state, i, 0)
-    use_storage(plant, state, memory, i)
-    curtail(plant, state, memory, i)
+    _nobody_acts(hidden, i)
+    read_row(environments, i, 0)
+    plan_outages(environments, i, 0)
+    use_storage(environments, i)
+    curtail(environments, i)
     _open_for_maintenance(state, i)
-    set_generators(state, memory, i)
-    if not flow_with_cascade(plant, network, state, memory, flow, i, False):
+    set_generators(environments, i)
+    if not flow_with_cascade(environments, i, False):
         lose(state, i, game_over_by_flow(state, i))
         return
-    remember_busbars(state, memory, i)
-    memory.setpoint[i] = memory.new_p[i] + state.actual_dispatch[i]
-    observe(network, state, memory, flow, i)
+    remember_busbars(environments, i)
+    hidden.setpoint[i] = hidden.new_p[i] + state.actual_dispatch[i]
+    observe(environments, i)
 
 
 @jit
 def begin_step(
-    plant: Plant,
-    network: Network,
-    state: GridState,
-    memory: Memory,
-    i: int,
-    kind: int,
-    target: int,
-    mask: int,
-    values: F32,
-    refuse_impossible: bool,
+    environments: Environments, i: int, kind: int, target: int, mask: int, values: F32, refuse_impossible: bool
 ) -> bool:
     """Play the step of environment ``i`` up to the redispatch; whether generators have to be dispatched.
 
     Args:
-        plant: constants of the grid.
-        network: the electrical model.
-        state: row ``i`` holds the last observation.
-        memory: row ``i`` holds what the last step left.
+        environments: row ``i`` holds the last observation and what the last step left.
         i: the row.
         kind: an :class:`~rl2grid.mdp.actions.ActionKind`.
         target: line or substation.
@@ -94,38 +82,41 @@ def begin_step(
         values: float32 [continuous], read if ``kind`` is INJECTION.
         refuse_impossible: make an action do nothing whose redispatch can never be carried out.
     """
+    state, hidden = environments.state, environments.hidden
     state.step[i] += 1
-    act_on_topology(state, memory, i, kind, target, mask)
+    act_on_topology(environments, i, kind, target, mask)
     injects = kind == _INJECTION
-    if injects and refuse_impossible and request_is_impossible(plant, state, memory, i, values):
+    if injects and refuse_impossible and request_is_impossible(environments, i, values):
         state.illegal[i] = True
         injects = False
-    nobody_injects(memory, i)
+    nobody_injects(hidden, i)
     if injects:
-        decode_injection(plant, state, memory, i, values)
-    read_row(memory, network, i, state.step[i])
-    plan_outages(memory, state, i, state.step[i])
-    return prepare_dispatch(plant, state, memory, i)
+        decode_injection(environments, i, values)
+    read_row(environments, i, state.step[i])
+    plan_outages(environments, i, state.step[i])
+    return prepare_dispatch(environments, i)
 
 
 @jit
-def prepare_dispatch(plant: Plant, state: GridState, memory: Memory, i: int) -> bool:
+def prepare_dispatch(environments: Environments, i: int) -> bool:
     """Storage, curtailment and the new targets; whether generators have to be dispatched."""
-    use_storage(plant, state, memory, i)
-    curtail(plant, state, memory, i)
-    request_redispatch(state, memory, i)
+    state, hidden = environments.state, environments.hidden
+    use_storage(environments, i)
+    curtail(environments, i)
+    request_redispatch(environments, i)
     if target_is_out_of_reach(state, i):
-        take_back_request(plant, state, memory, i)
+        take_back_request(environments, i)
         state.illegal[i] = True
-        memory.changed_line[i] = -1
-        memory.changed_sub[i] = -1
-    return needs_dispatch(state, memory, i)
+        hidden.changed_line[i] = -1
+        hidden.changed_sub[i] = -1
+    return needs_dispatch(environments, i)
 
 
 @jit
-def dispatch_or_lose(state: GridState, memory: Memory, i: int) -> bool:
+def dispatch_or_lose(environments: Environments, i: int) -> bool:
     """Find the exact dispatch of row ``i``; without one the game is over."""
-    if dispatch(state, memory, i):
+    state = environments.state
+    if dispatch(environments, i):
         return True
     lose_by_dispatch(state, i)
     return False
@@ -139,18 +130,11 @@ def lose_by_dispatch(state: GridState, i: int) -> None:
 
 
 @jit
-def finish_step(
-    plant: Plant,
-    network: Network,
-    state: GridState,
-    memory: Memory,
-    flow: FlowState,
-    opponent: OpponentState,
-    i: int,
-) -> None:
+def finish_step(environments: Environments, i: int) -> None:
     """Play the step of environment ``i`` from after the redispatch to the observation."""
+    state, opponent = environments.state, environments.opponent
     _open_for_maintenance(state, i)
-    set_generators(state, memory, i)
+    set_generators(environments, i)
     opponent_step(state, opponent, i)
     state.attacked[i] = opponent.attacked[i]
     for line in range(state.attacked.shape[1]):
@@ -158,23 +142,24 @@ def finish_step(
             open_line(state, i, line)
             written = opponent.cooldown_written[i, line]
             state.time_before_cooldown_line[i, line] = max(state.time_before_cooldown_line[i, line], written)
-    run_and_register(plant, network, state, memory, flow, i)
+    run_and_register(environments, i)
     if not state.terminated[i]:
         state.truncated[i] = state.step[i] >= state.episode_length[i]
 
 
 @jit
-def run_and_register(plant: Plant, network: Network, state: GridState, memory: Memory, flow: FlowState, i: int) -> None:
+def run_and_register(environments: Environments, i: int) -> None:
     """Power flow and cascade, then the counters and the observation; or the game over."""
-    if not flow_with_cascade(plant, network, state, memory, flow, i, True):
+    state, hidden = environments.state, environments.hidden
+    if not flow_with_cascade(environments, i, True):
         lose(state, i, game_over_by_flow(state, i))
         return
-    remember_busbars(state, memory, i)
-    _count_down_lines(plant, state, memory, i)
-    _count_overloads(state, memory, i)
-    _count_down_substations(plant, state, memory, i)
-    memory.setpoint[i] = memory.new_p[i] + state.actual_dispatch[i]
-    observe(network, state, memory, flow, i)
+    remember_busbars(environments, i)
+    _count_down_lines(environments, i)
+    _count_overloads(environments, i)
+    _count_down_substations(environments, i)
+    hidden.setpoint[i] = hidden.new_p[i] + state.actual_dispatch[i]
+    observe(environments, i)
 
 
 @jit
@@ -194,16 +179,16 @@ def lose(state: GridState, i: int, reason: int) -> None:
 
 
 @jit
-def _nobody_acts(memory: Memory, i: int) -> None:
-    memory.changed_line[i] = -1
-    memory.changed_sub[i] = -1
-    nobody_injects(memory, i)
+def _nobody_acts(hidden: HiddenState, i: int) -> None:
+    hidden.changed_line[i] = -1
+    hidden.changed_sub[i] = -1
+    nobody_injects(hidden, i)
 
 
 @jit
-def nobody_injects(memory: Memory, i: int) -> None:
-    memory.request[i] = 0.0
-    memory.storage_request[i] = 0.0
+def nobody_injects(hidden: HiddenState, i: int) -> None:
+    hidden.request[i] = 0.0
+    hidden.storage_request[i] = 0.0
 
 
 @jit
@@ -214,40 +199,43 @@ def _open_for_maintenance(state: GridState, i: int) -> None:
 
 
 @jit
-def _count_down_lines(plant: Plant, state: GridState, memory: Memory, i: int) -> None:
+def _count_down_lines(environments: Environments, i: int) -> None:
     """Cooldowns of lines: one step less, then what protections, maintenance and the agent impose."""
+    constants, state, hidden = environments.constants, environments.state, environments.hidden
     cooldown = state.time_before_cooldown_line[i]
     for line in range(cooldown.shape[0]):
         if cooldown[line] > 0:
             cooldown[line] -= 1
-        if memory.tripped[i, line]:
-            cooldown[line] = plant.reconnection[0]
+        if hidden.tripped[i, line]:
+            cooldown[line] = constants.reconnection[0]
         if state.time_next_maintenance[i, line] == 0:
             cooldown[line] = max(cooldown[line], state.duration_next_maintenance[i, line])
-    changed = memory.changed_line[i]
-    if changed >= 0 and plant.cooldown_line[0] > 0:
-        cooldown[changed] = max(cooldown[changed], plant.cooldown_line[0])
+    changed = hidden.changed_line[i]
+    if changed >= 0 and constants.cooldown_line[0] > 0:
+        cooldown[changed] = max(cooldown[changed], constants.cooldown_line[0])
 
 
 @jit
-def _count_overloads(state: GridState, memory: Memory, i: int) -> None:
+def _count_overloads(environments: Environments, i: int) -> None:
+    state, hidden = environments.state, environments.hidden
     for line in range(state.a_or.shape[1]):
         if state.a_or[i, line] > state.thermal_limit[line]:
             state.timestep_overflow[i, line] += 1
-            memory.protection[i, line] += 1
+            hidden.protection[i, line] += 1
         else:
             state.timestep_overflow[i, line] = 0
-            memory.protection[i, line] = 0
+            hidden.protection[i, line] = 0
 
 
 @jit
-def _count_down_substations(plant: Plant, state: GridState, memory: Memory, i: int) -> None:
-    if plant.cooldown_sub[0] == 0:
+def _count_down_substations(environments: Environments, i: int) -> None:
+    constants, state, hidden = environments.constants, environments.state, environments.hidden
+    if constants.cooldown_sub[0] == 0:
         return
     cooldown = state.time_before_cooldown_sub[i]
     for sub in range(cooldown.shape[0]):
         if cooldown[sub] > 0:
             cooldown[sub] -= 1
-    changed = memory.changed_sub[i]
+    changed = hidden.changed_sub[i]
     if changed >= 0:
-        cooldown[changed] = plant.cooldown_sub[0]
+        cooldown[changed] = constants.cooldown_sub[0]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from rl2grid.compile import jit
-from rl2grid.engines.native.memory import Memory
+from rl2grid.engines.native.environments import Environments
 from rl2grid.mdp.actions import ActionKind, is_legal
 from rl2grid.mdp.state import GridState
 
@@ -18,10 +18,11 @@ _RECONNECT, _RESTORE = int(ActionKind.RECONNECT), int(ActionKind.RESTORE)
 
 
 @jit
-def act_on_topology(state: GridState, memory: Memory, i: int, kind: int, target: int, mask: int) -> None:
+def act_on_topology(environments: Environments, i: int, kind: int, target: int, mask: int) -> None:
     """Merge a topology action into ``topo_vect``, or flag it as illegal and leave everything as it is."""
-    memory.changed_line[i] = -1
-    memory.changed_sub[i] = -1
+    state, hidden = environments.state, environments.hidden
+    hidden.changed_line[i] = -1
+    hidden.changed_sub[i] = -1
     state.illegal[i] = False
     state.ambiguous[i] = False
     if kind == _RESTORE and not _has_element_on_busbar_2(state, i, target):
@@ -30,17 +31,17 @@ def act_on_topology(state: GridState, memory: Memory, i: int, kind: int, target:
         state.illegal[i] = True
         return
     if kind == _MOVE:
-        memory.changed_sub[i] = target
+        hidden.changed_sub[i] = target
         _move(state, i, target, mask)
     elif kind == _RESTORE:
-        memory.changed_sub[i] = target
+        hidden.changed_sub[i] = target
         _restore(state, i, target)
     elif kind == _SWITCH:
-        memory.changed_line[i] = target
-        _switch(state, memory, i, target)
+        hidden.changed_line[i] = target
+        _switch(environments, i, target)
     elif kind == _RECONNECT:
-        memory.changed_line[i] = target
-        close_line(state, memory, i, target)
+        hidden.changed_line[i] = target
+        close_line(environments, i, target)
 
 
 @jit
@@ -51,19 +52,21 @@ def open_line(state: GridState, i: int, line: int) -> None:
 
 
 @jit
-def close_line(state: GridState, memory: Memory, i: int, line: int) -> None:
+def close_line(environments: Environments, i: int, line: int) -> None:
     """Bring each open end of a line back to the busbar it was on last."""
+    state, hidden = environments.state, environments.hidden
     for position in (state.line_or_pos_topo_vect[line], state.line_ex_pos_topo_vect[line]):
         if state.topo_vect[i, position] < 0:
-            state.topo_vect[i, position] = memory.last_bus[i, position]
+            state.topo_vect[i, position] = hidden.last_bus[i, position]
 
 
 @jit
-def remember_busbars(state: GridState, memory: Memory, i: int) -> None:
+def remember_busbars(environments: Environments, i: int) -> None:
     """Note the busbar of every element that is on one."""
+    state, hidden = environments.state, environments.hidden
     for element in range(state.topo_vect.shape[1]):
         if state.topo_vect[i, element] > 0:
-            memory.last_bus[i, element] = state.topo_vect[i, element]
+            hidden.last_bus[i, element] = state.topo_vect[i, element]
 
 
 @jit
@@ -92,9 +95,10 @@ def _restore(state: GridState, i: int, sub: int) -> None:
 
 
 @jit
-def _switch(state: GridState, memory: Memory, i: int, line: int) -> None:
+def _switch(environments: Environments, i: int, line: int) -> None:
+    state = environments.state
     origin, extremity = state.line_or_pos_topo_vect[line], state.line_ex_pos_topo_vect[line]
     if state.topo_vect[i, origin] > 0 or state.topo_vect[i, extremity] > 0:
         open_line(state, i, line)
     else:
-        close_line(state, memory, i, line)
+        close_line(environments, i, line)

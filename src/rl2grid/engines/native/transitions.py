@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rl2grid.engines.effects import clipping, refusal
+from rl2grid.engines.native.action_notes import ActionNotes, copy_notes
 from rl2grid.engines.native.advance import (
     ALONE,
     DEFAULT,
@@ -26,10 +27,8 @@ from rl2grid.engines.native.advance import (
     write_observations,
 )
 from rl2grid.engines.native.engine import NativeEngine
-from rl2grid.engines.native.outcome import Outcome, copy_outcome, new_outcome
 from rl2grid.engines.transition import Transitions
 from rl2grid.grids import Grid
-from rl2grid.handles import table_of
 from rl2grid.mdp.actions import ActionKind, StepAction
 from rl2grid.mdp.rewards import default_components, paper_components, released_components
 from rl2grid.mdp.state import F32
@@ -77,15 +76,15 @@ class Commands:
 class ActionEffect:
     """What became of one agent's action; put into words when somebody reads it."""
 
-    __slots__ = ("_commands", "_grid", "_outcome", "_row")
+    __slots__ = ("_commands", "_grid", "_notes", "_row")
 
-    def __init__(self, grid: Grid, outcome: Outcome, commands: Commands, row: int) -> None:
-        self._grid, self._outcome, self._commands, self._row = grid, outcome, commands, row
+    def __init__(self, grid: Grid, notes: ActionNotes, commands: Commands, row: int) -> None:
+        self._grid, self._notes, self._commands, self._row = grid, notes, commands, row
 
     def __str__(self) -> str:
         action = self._commands.action(self._row)
-        refused = refusal(action, int(self._outcome.cooldown_left[self._row]))
-        return refused or clipping(self._grid, self._outcome, self._row, action)
+        refused = refusal(action, int(self._notes.cooldown_left[self._row]))
+        return refused or clipping(self._grid, self._notes, self._row, action)
 
     __repr__ = __str__
 
@@ -108,8 +107,6 @@ class NativeTransitions(Transitions):
 
     def __post_init__(self) -> None:
         n = len(self.engine.state.step)
-        self._outcome = new_outcome(self.engine.grid, n)
-        self._outcome_table = table_of(self._outcome)
         self._reward_code = _COMPILED_IN.get(self.reward.components)
         self._threads = ThreadPoolExecutor(os.cpu_count() or 1, "rl2grid")
         self._rows = np.arange(n)
@@ -138,8 +135,9 @@ class NativeTransitions(Transitions):
             super().play(i, action)
             return
         self._advance_part(self._rows[i : i + 1], _one(action))
-        refused = refusal(action, int(self._outcome.cooldown_left[i]))
-        self.effects[i] = refused or clipping(self.engine.grid, self._outcome, i, action)
+        notes = self.engine.environments.notes
+        refused = refusal(action, int(notes.cooldown_left[i]))
+        self.effects[i] = refused or clipping(self.engine.grid, notes, i, action)
 
     def play_rows(self, rows: I64, commands: Commands, num_threads: int) -> None:
         """Play one transition in each of ``rows``, entry k of ``commands`` in row ``rows[k]``."""
@@ -155,15 +153,15 @@ class NativeTransitions(Transitions):
 
     def write_observations(self, rows: I64, shift: F32, scale: F32, out: F32) -> None:
         """Write the observations of ``rows``, shifted and scaled, to the same rows of ``out``, float32 [n, feature]."""
-        write_observations(self.engine.addresses, rows, self.topology_task, shift, scale, out)
+        write_observations(self.engine.handle.address, rows, self.topology_task, shift, scale, out)
 
     def effects_of(self, commands: Commands) -> NDArray[np.object_]:
         """What became of the actions of all environments, object [n]."""
         if not self.is_compiled:
             return np.array([self.effects[i] for i in range(len(commands.kinds))], object)
-        grid, outcome = self.engine.grid, copy_outcome(self._outcome)
+        grid, notes = self.engine.grid, copy_notes(self.engine.environments.notes)
         effects = np.empty(len(commands.kinds), object)
-        effects[:] = [ActionEffect(grid, outcome, commands, i) for i in range(len(effects))]
+        effects[:] = [ActionEffect(grid, notes, commands, i) for i in range(len(effects))]
         return effects
 
     def _advance(self, rows: I64, commands: Commands, num_threads: int) -> None:
@@ -178,8 +176,7 @@ class NativeTransitions(Transitions):
     def _advance_part(self, rows: I64, commands: Commands) -> None:
         weights = self.reward.weights
         advance(
-            self.engine.addresses,
-            self._outcome_table.ctypes.data,
+            self.engine.handle.address,
             rows,
             commands.kinds,
             commands.targets,

@@ -14,19 +14,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rl2grid.engines.native.engine import NativeEngine
-from rl2grid.engines.native.tables import Arrays
+from rl2grid.engines.native.environments import Environments
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
-from rl2grid.handles import table_of
+from rl2grid.handles import Handle
 from rl2grid.mdp.actions import ActionCatalogue, ActionKind, Ids
 from rl2grid.mdp.termination import GameOver
 from rl2grid.powerflow.batch import (
     MOVE,
     NOTHING,
     SWITCH,
-    Bench,
+    BatchSolver,
+    ChangeOutcomes,
     Changes,
-    Outcomes,
     Snapshot,
     new_outcomes,
     new_snapshot,
@@ -102,7 +102,7 @@ class WhatIf:
         self._network = load_network(grid) if network is None else network
         wiring = new_wiring(grid, self._network)
         self._snapshot = new_snapshot(grid)
-        self._benches = [Bench(grid, self._network, wiring, self._snapshot) for _ in range(num_threads)]
+        self._solvers = [BatchSolver(grid, self._network, wiring, self._snapshot) for _ in range(num_threads)]
         self._threads = ThreadPoolExecutor(num_threads, "what-if")
 
     def actions(
@@ -155,7 +155,7 @@ class WhatIf:
         unsafe = (outcomes.verdict != 0) | (outcomes.overloads > 0)
         return Security(float(outcomes.worst_loading[lost].max()), int(unsafe[lost].sum()), int(lost.sum()))
 
-    def solve(self, snapshot: Snapshot, changes: Changes, rho: F32 | None = None) -> Outcomes:
+    def solve(self, snapshot: Snapshot, changes: Changes, rho: F32 | None = None) -> ChangeOutcomes:
         """The flow after each change; see :func:`rl2grid.powerflow.batch.solve_changes`."""
         n, n_line = len(changes.kind), self.grid.n_line
         if rho is not None and (rho.shape != (n, n_line) or rho.dtype != np.float32 or not rho.flags.c_contiguous):
@@ -163,12 +163,12 @@ class WhatIf:
         for kept, array in zip(self._snapshot, snapshot, strict=True):
             np.copyto(kept, array)
         outcomes = new_outcomes(n, np.zeros((0, n_line), np.float32) if rho is None else rho)
-        tables = table_of(changes), table_of(outcomes)
+        handles = Handle(changes), Handle(outcomes)
         order = np.lexsort((changes.target, -changes.kind)).astype(np.int32)
         parts = self._parts(order)
 
         def solve_part(k: int) -> None:
-            self._benches[k].solve(*tables, parts[k])
+            self._solvers[k].solve(*handles, parts[k])
 
         if len(parts) == 1:
             solve_part(0)
@@ -177,7 +177,7 @@ class WhatIf:
         return outcomes
 
     def _parts(self, order: I32) -> list[I32]:
-        n_parts = min(len(self._benches), len(order) // _SMALLEST_PART)
+        n_parts = min(len(self._solvers), len(order) // _SMALLEST_PART)
         return np.array_split(order, n_parts) if n_parts > 1 else [order]
 
 
@@ -189,7 +189,7 @@ def snapshot_of(engine: NativeEngine, i: int) -> Snapshot:
     """
     if engine.state.terminated[i] or not engine.state.line_status[i].any():
         raise UsageError("Nothing can be asked after a game over or before a reset: reset the environment first.")
-    return _snapshot(engine.arrays, i)
+    return _snapshot(engine.environments, i)
 
 
 def forecast_of(engine: NativeEngine, i: int, horizon: int = 1) -> Snapshot | None:
@@ -202,8 +202,8 @@ def forecast_of(engine: NativeEngine, i: int, horizon: int = 1) -> Snapshot | No
     Raises:
         UsageError: after a game over, or without such a forecast.
     """
-    arrays = engine.foresee(i, horizon)
-    return None if arrays is None else _snapshot(arrays, 0)
+    foreseen = engine.foresee(i, horizon)
+    return None if foreseen is None else _snapshot(foreseen, 0)
 
 
 def what_if(
@@ -241,24 +241,24 @@ def _solver_of(engine: NativeEngine, num_threads: int) -> WhatIf:
     """The solver that an engine has used before, or a new one."""
     solvers = _SOLVERS.setdefault(engine, {})
     if num_threads not in solvers:
-        solvers[num_threads] = WhatIf(engine.grid, engine.arrays.network, num_threads)
+        solvers[num_threads] = WhatIf(engine.grid, engine.environments.network, num_threads)
     return solvers[num_threads]
 
 
 _SOLVERS: WeakKeyDictionary[NativeEngine, dict[int, WhatIf]] = WeakKeyDictionary()
 
 
-def _snapshot(arrays: Arrays, i: int) -> Snapshot:
-    state, memory = arrays.state, arrays.memory
+def _snapshot(environments: Environments, i: int) -> Snapshot:
+    state, hidden = environments.state, environments.hidden
     return Snapshot(
         state.topo_vect[i].copy(),
-        memory.last_bus[i].copy(),
+        hidden.last_bus[i].copy(),
         state.time_before_cooldown_line[i].copy(),
         state.time_before_cooldown_sub[i].copy(),
-        memory.gen_p[i].copy(),
-        memory.gen_v[i].astype(np.float32),
-        memory.load_p[i].copy(),
-        memory.load_q[i].copy(),
+        hidden.gen_p[i].copy(),
+        hidden.gen_v[i].astype(np.float32),
+        hidden.load_p[i].copy(),
+        hidden.load_q[i].copy(),
         state.storage_power[i].copy(),
     )
 

@@ -14,10 +14,10 @@ from rl2grid.mdp.state import F32, F64, I32, Flags
 I64 = NDArray[np.int64]
 
 LOAD_P, LOAD_Q, PROD_P, PROD_V = range(4)
-"""Columns of :attr:`Memory.series` and of :attr:`Memory.forecast`."""
+"""Columns of :attr:`HiddenState.series` and of :attr:`HiddenState.forecast`."""
 
 
-class Memory(NamedTuple):
+class HiddenState(NamedTuple):
     """Structure of arrays of ``n`` environments; shapes in brackets, Grid2Op's attribute in parentheses."""
 
     # From step to step.
@@ -57,8 +57,8 @@ class Memory(NamedTuple):
     next_outage: I32  # [n, line] outage under way or next to come; -1 if none
 
 
-def new_memory(grid: Grid, n: int, outages: int) -> Memory:
-    """A blank memory with room for ``outages`` planned outages per environment."""
+def new_hidden_state(grid: Grid, n: int, outages: int) -> HiddenState:
+    """A blank hidden with room for ``outages`` planned outages per environment."""
     line, gen, load, storage, topo = grid.n_line, grid.n_gen, grid.n_load, grid.n_storage, grid.dim_topo
 
     def floats(*shape: int) -> F32:
@@ -70,7 +70,7 @@ def new_memory(grid: Grid, n: int, outages: int) -> Memory:
     def flags(*shape: int) -> Flags:
         return np.zeros((n, *shape), np.bool_)
 
-    return Memory(
+    return HiddenState(
         last_bus=ints(topo),
         protection=ints(line),
         modified=flags(gen),
@@ -105,11 +105,11 @@ def new_memory(grid: Grid, n: int, outages: int) -> Memory:
 
 
 @jit
-def begin_memory(memory: Memory, i: int) -> None:
+def begin_hidden_state(hidden: HiddenState, i: int) -> None:
     """Forget the last episode of row ``i``; series and outages are the engine's to set."""
-    memory.last_bus[i] = 1
-    memory.protection[i] = 0
-    memory.modified[i] = False
-    memory.setpoint[i] = 0.0
-    memory.curtailed[i] = 0.0
-    memory.stored[i] = 0.0
+    hidden.last_bus[i] = 1
+    hidden.protection[i] = 0
+    hidden.modified[i] = False
+    hidden.setpoint[i] = 0.0
+    hidden.curtailed[i] = 0.0
+    hidden.stored[i] = 0.0

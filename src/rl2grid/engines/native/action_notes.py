@@ -7,15 +7,14 @@ from typing import NamedTuple
 import numpy as np
 
 from rl2grid.compile import jit
-from rl2grid.grids import Grid, load_grid
-from rl2grid.handles import layout_of, opener
+from rl2grid.grids import Grid
 from rl2grid.mdp.actions import ActionKind
 from rl2grid.mdp.state import F32, I32, Flags, GridState
 
 _MOVE, _SWITCH = int(ActionKind.MOVE), int(ActionKind.SWITCH)
 
 
-class Outcome(NamedTuple):
+class ActionNotes(NamedTuple):
     """Structure of arrays of ``n`` environments, right after the agent's own step."""
 
     cooldown_left: I32  # [n] steps that the line or substation of a topology action still cooled down before it
@@ -27,9 +26,9 @@ class Outcome(NamedTuple):
     storage_power: F32  # [n, storage] MW
 
 
-def new_outcome(grid: Grid, n: int) -> Outcome:
-    """A blank outcome."""
-    return Outcome(
+def new_action_notes(grid: Grid, n: int) -> ActionNotes:
+    """Blank notes."""
+    return ActionNotes(
         np.zeros(n, np.int32),
         np.zeros(n, np.bool_),
         np.zeros(n, np.bool_),
@@ -40,30 +39,27 @@ def new_outcome(grid: Grid, n: int) -> Outcome:
     )
 
 
-def copy_outcome(outcome: Outcome) -> Outcome:
+def copy_notes(notes: ActionNotes) -> ActionNotes:
     """A copy that the next step leaves alone."""
-    return Outcome._make(array.copy() for array in outcome)
+    return ActionNotes._make(array.copy() for array in notes)
 
 
 @jit
-def note_before(outcome: Outcome, state: GridState, i: int, kind: int, target: int) -> None:
+def note_before(notes: ActionNotes, state: GridState, i: int, kind: int, target: int) -> None:
     """Note, before the agent's step, what would refuse its action."""
-    outcome.cooldown_left[i] = 0
+    notes.cooldown_left[i] = 0
     if kind == _MOVE:
-        outcome.cooldown_left[i] = state.time_before_cooldown_sub[i, target]
+        notes.cooldown_left[i] = state.time_before_cooldown_sub[i, target]
     elif kind == _SWITCH:
-        outcome.cooldown_left[i] = state.time_before_cooldown_line[i, target]
+        notes.cooldown_left[i] = state.time_before_cooldown_line[i, target]
 
 
 @jit
-def note_after(outcome: Outcome, state: GridState, i: int) -> None:
+def note_after(notes: ActionNotes, state: GridState, i: int) -> None:
     """Note, right after the agent's step, what became of its action."""
-    outcome.terminated[i] = state.terminated[i]
-    outcome.illegal[i] = state.illegal[i]
-    outcome.ambiguous[i] = state.ambiguous[i]
-    outcome.target_dispatch[i] = state.target_dispatch[i]
-    outcome.actual_dispatch[i] = state.actual_dispatch[i]
-    outcome.storage_power[i] = state.storage_power[i]
-
-
-open_outcome = opener("Outcome", layout_of(new_outcome(load_grid("bus14"), 0)))
+    notes.terminated[i] = state.terminated[i]
+    notes.illegal[i] = state.illegal[i]
+    notes.ambiguous[i] = state.ambiguous[i]
+    notes.target_dispatch[i] = state.target_dispatch[i]
+    notes.actual_dispatch[i] = state.actual_dispatch[i]
+    notes.storage_power[i] = state.storage_power[i]

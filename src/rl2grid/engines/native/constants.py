@@ -14,7 +14,7 @@ INITIAL_CHARGE = np.float32(0.5)
 """Share of a storage unit's capacity that is charged at a reset (``Parameters.INIT_STORAGE_CAPACITY``)."""
 
 
-class Plant(NamedTuple):
+class GridConstants(NamedTuple):
     """Arrays without environment axis; shapes in brackets. Names are Grid2Op's where it has the attribute."""
 
     cooldown_line: I32  # [1] steps
@@ -34,10 +34,10 @@ class Plant(NamedTuple):
     curtail_gen: I32  # [entry] generators of its curtailment
 
 
-def new_plant(grid: Grid) -> Plant:
+def new_constants(grid: Grid) -> GridConstants:
     """The constants of ``grid``."""
     rules, layout = grid.rules, continuous_layout(grid)
-    return Plant(
+    return GridConstants(
         cooldown_line=np.array([rules.cooldown_line], np.int32),
         cooldown_sub=np.array([rules.cooldown_sub], np.int32),
         reconnection=np.array([rules.reconnection], np.int32),

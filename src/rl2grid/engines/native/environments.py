@@ -1,0 +1,52 @@
+"""Everything that an engine works with, as one value: compiled code is handed its address and passes it on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+from rl2grid.engines.native.action_notes import ActionNotes, new_action_notes
+from rl2grid.engines.native.constants import GridConstants, new_constants
+from rl2grid.engines.native.hidden_state import HiddenState, new_hidden_state
+from rl2grid.grids import Grid, OpponentConfig, load_grid
+from rl2grid.handles import layout_of, opener
+from rl2grid.mdp.opponents import OpponentState, new_opponent_state
+from rl2grid.mdp.state import GridState, new_state
+from rl2grid.powerflow.ac import FlowState, new_flow_state
+from rl2grid.powerflow.model import Network, load_network
+
+
+class Environments(NamedTuple):
+    """All arrays of ``n`` environments of one grid.
+
+    Compiled functions take it as ``environments`` (a handle, see :mod:`rl2grid.handles`) and the row ``i`` that they
+    work on; those that look at nothing but the state take ``(state, i)``, as the functions of :mod:`rl2grid.mdp` do.
+    """
+
+    constants: GridConstants
+    network: Network
+    state: GridState
+    hidden: HiddenState
+    flow: FlowState
+    opponent: OpponentState
+    notes: ActionNotes
+
+
+def new_environments(grid: Grid, network: Network, n: int, opponent: bool, outages: int = 0) -> Environments:
+    """Blank arrays for ``n`` environments of ``grid``, with room for ``outages`` planned outages each."""
+    attacked = grid if opponent else replace(grid, opponent=OpponentConfig("none"))
+    return Environments(
+        new_constants(grid),
+        network,
+        new_state(grid, n),
+        new_hidden_state(grid, n, outages),
+        new_flow_state(network, n),
+        new_opponent_state(attacked, n),
+        new_action_notes(grid, n),
+    )
+
+
+# Layouts are the same for every grid: names, dtypes and axes.
+open_environments = opener(
+    layout_of(new_environments(load_grid("bus14"), load_network(load_grid("bus14")), 1, opponent=False))
+)
