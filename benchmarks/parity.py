@@ -37,7 +37,7 @@ from rl2grid.engines.differential import CAUSES, TOLERANCES, SideBySide
 from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.engines.probes import PROBES, Probe, make_probe
 from rl2grid.engines.reference.engine import ReferenceEngine
-from rl2grid.envs.player import single_spaces
+from rl2grid.envs.description import single_spaces
 from rl2grid.envs.tasks import find_task
 from rl2grid.grids import GRID_IDS, Grid, load_grid
 from rl2grid.mdp.actions import ActionKind, StepAction, legal_actions, level_catalogue

@@ -9,7 +9,7 @@ import pytest
 
 import rl2grid  # noqa: F401  (registers the tasks)
 from rl2grid.agents.greedy_topology import GreedyN1, effects, insecurity
-from rl2grid.envs.foresight import busbars_after
+from rl2grid.envs.outages_after_action import busbars_after
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import make_agent
 from rl2grid.grids import load_grid

@@ -102,7 +102,7 @@ def test_transition_adds_up_its_grid_steps(plain, idle):
     _, info = idle.reset(seed=0, options=options)
     assert info["n_steps"] > 100
     rewards, costs, components = [], [], []
-    while plain.unwrapped._player.state.step[0] < info["step"]:
+    while plain.unwrapped.state.step[0] < info["step"]:
         observation, reward, terminated, truncated, single = plain.step(0)
         rewards.append(reward)
         costs.append(single["costs"]["TLO"])
@@ -134,7 +134,7 @@ def test_transition_adds_up_its_grid_steps(plain, idle):
 def test_idle_never_hands_over_a_safe_grid(idle):
     idle.reset(seed=0, options={"scenario": month(), "start": 0})
     for _ in range(5):
-        rho = idle._player.state.rho[0]
+        rho = idle.state.rho[0]
         assert rho.max() >= 0.95
         if any(idle.step(0)[2:4]):
             break
@@ -265,7 +265,7 @@ def test_physical_units_on_request(engine):
     with make("bus14-T0", engine=engine, normalize=None) as environment:
         observation, _ = environment.reset(seed=0)
         slices = environment.unwrapped.observation_slices
-        np.testing.assert_array_equal(observation[slices["gen_p"]], environment.unwrapped._player.state.gen_p[0])
+        np.testing.assert_array_equal(observation[slices["gen_p"]], environment.unwrapped.state.gen_p[0])
 
 
 def test_step_listeners_see_every_grid_step(idle):

@@ -22,7 +22,7 @@ def test_the_weighted_score_is_added():
         expected, mine = plain.step(action), scored.step(action)
         assert (mine[0] == expected[0]).all()
         score = mine[4]["n_minus_1"]
-        assert score == pytest.approx(n_minus_1_score(scored.unwrapped._player.engine, 0))
+        assert score == pytest.approx(n_minus_1_score(scored.unwrapped._environments.engine, 0))
         assert 0 <= score <= 1
         assert mine[1] == pytest.approx(expected[1] + 0.5 * score)
         assert mine[4]["reward_components"]["security"] == 0.5 * score

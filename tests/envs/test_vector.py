@@ -135,7 +135,7 @@ def test_refusals_of_a_worker_arrive_as_one_sentence():
 def test_dead_worker_is_reported():
     vector = make_vector(1, 1)
     vector.reset(seed=0)
-    vector.unwrapped._remotes[0]._process.kill()
+    vector.unwrapped._rows._workers[0]._process.kill()
     with pytest.raises(RuntimeError, match="died"):
         vector.step([0])
     vector.close()

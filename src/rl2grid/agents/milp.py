@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rl2grid.agents.agent import Action, Info, Observation
 from rl2grid.agents.dc_flow import DcPoint, buses, dc_flow, dc_point, is_connected
 from rl2grid.agents.linear_programme import F64, Affine, Programme
-from rl2grid.envs.foresight import busbars_after
+from rl2grid.envs.outages_after_action import busbars_after
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
 from rl2grid.mdp.actions import ActionCatalogue, ActionKind, full_catalogue, moved_elements

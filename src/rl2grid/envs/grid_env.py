@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rl2grid.engines.transition import Listener
-from rl2grid.envs.player import SimulationResult, TaskDescription, TaskPlayer, single_spaces
+from rl2grid.envs.description import TaskDescription, single_spaces
+from rl2grid.envs.environments import Environments, SimulationResult
 from rl2grid.envs.tasks import TaskOptions, find_task
 from rl2grid.errors import UsageError, one_of
 from rl2grid.mdp.state import GridState
@@ -118,19 +119,19 @@ class PowerGridEnv(gymnasium.Env[NDArray[np.float32], Any], TaskDescription):
             maintenance,
             opponent,
         )
-        self._player = TaskPlayer(self.task, self.options, 1)
+        self._environments = Environments(self.task, self.options, 1)
         observations, self.action_space = single_spaces(self.task)
         self.observation_space = cast("gymnasium.Space[NDArray[np.float32]]", observations)
 
     @property
     def step_listeners(self) -> list[Listener]:
         """Functions called after every grid step with the state and row 0: append your own."""
-        return self._player.transitions.listeners
+        return self._environments.transitions.listeners
 
     @property
     def state(self) -> GridState:
         """The grid after the last step, in physical units: row 0 of each array. To be looked at, not written to."""
-        return self._player.state
+        return self._environments.state
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -142,8 +143,8 @@ class PowerGridEnv(gymnasium.Env[NDArray[np.float32], Any], TaskDescription):
         """
         super().reset(seed=seed)
         self._last_action = None
-        self._player.reset(0, seed, options)
-        return self._observation(), self._player.info(0)
+        self._environments.begin(0, seed, options)
+        return self._observation(), self._environments.info(0)
 
     def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Play the agent's action and the heuristic steps to the next decision.
@@ -151,12 +152,12 @@ class PowerGridEnv(gymnasium.Env[NDArray[np.float32], Any], TaskDescription):
         Raises:
             UsageError: the action has the wrong shape or value, or the episode is over.
         """
-        player = self._player
-        player.step(0, action)
+        played = self._environments
+        played.play(0, action)
         if self.render_mode is not None:
             self._last_action = np.array(action)
-        ended = bool(player.state.terminated[0]), bool(player.state.truncated[0])
-        return self._observation(), player.reward(0), *ended, player.info(0)
+        ended = bool(played.state.terminated[0]), bool(played.state.truncated[0])
+        return self._observation(), played.reward(0), *ended, played.info(0)
 
     def simulate(self, action: Any, horizon: int = 1) -> SimulationResult:
         """What ``action`` would bring on the forecast ``horizon`` steps ahead; the state stays untouched.
@@ -167,7 +168,7 @@ class PowerGridEnv(gymnasium.Env[NDArray[np.float32], Any], TaskDescription):
         Raises:
             UsageError: a wrong action or horizon, no forecast for it, or no episode in progress.
         """
-        return self._player.simulate(0, action, horizon)
+        return self._environments.simulate(0, action, horizon)
 
     def what_if(self, actions: Sequence[int] | None = None) -> ActionOutcomes:
         """What each topology action would do to the loadings of the next step, by its forecast, in one call.
@@ -185,7 +186,7 @@ class PowerGridEnv(gymnasium.Env[NDArray[np.float32], Any], TaskDescription):
             UsageError: continuous actions, an action that does not exist, no episode in progress, or the reference
                 engine.
         """
-        return self._player.what_if(0, actions)
+        return self._environments.what_if(0, actions)
 
     def security(self, action: int | None = None) -> OutageOutcomes:
         """What the loss of each line would do (N-1), in one call; see ``docs/what_if.md``.
@@ -202,7 +203,7 @@ class PowerGridEnv(gymnasium.Env[NDArray[np.float32], Any], TaskDescription):
             UsageError: continuous actions, an action that does not exist, no episode in progress, or the reference
                 engine.
         """
-        return self._player.security(0) if action is None else self._player.security_after(0, action)
+        return self._environments.security(0) if action is None else self._environments.security_after(0, action)
 
     def n_minus_1_score(self) -> float:
         """Share of the lines in service whose loss would leave neither an overload nor a collapse.
@@ -210,7 +211,7 @@ class PowerGridEnv(gymnasium.Env[NDArray[np.float32], Any], TaskDescription):
         Raises:
             UsageError: no episode in progress, or the reference engine.
         """
-        return self._player.n_minus_1_score(0)
+        return self._environments.n_minus_1_score(0)
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Which discrete actions are legal now, bool [action].
@@ -219,7 +220,7 @@ class PowerGridEnv(gymnasium.Env[NDArray[np.float32], Any], TaskDescription):
             UsageError: the task has continuous actions.
         """
         mask = np.zeros(self.task.n_actions, np.bool_)
-        self._player.write_action_mask(0, mask)
+        self._environments.write_action_mask(0, mask)
         return mask
 
     def clock_at(self, step: int) -> datetime:
@@ -228,7 +229,7 @@ class PowerGridEnv(gymnasium.Env[NDArray[np.float32], Any], TaskDescription):
         Raises:
             UsageError: the environment was not reset yet.
         """
-        return self._player.clock(0, step)
+        return self._environments.clock(0, step)
 
     def render(self) -> NDArray[np.uint8]:  # type: ignore[override]
         """The grid and what the agent did last as a picture, uint8 [720, 1280, 3].
@@ -255,9 +256,9 @@ class PowerGridEnv(gymnasium.Env[NDArray[np.float32], Any], TaskDescription):
 
     def close(self) -> None:
         """Free the simulator."""
-        self._player.close()
+        self._environments.close()
 
     def _observation(self) -> NDArray[np.float32]:
         observation = np.zeros(self.observation_space.shape or (), np.float32)
-        self._player.write_observation(0, observation)
+        self._environments.write_observation(0, observation)
         return observation

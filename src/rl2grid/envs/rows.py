@@ -1,93 +1,114 @@
-"""Rows of a vector environment, stepped together in one process."""
+"""The rows of a vector environment: one protocol, whoever plays them.
+
+:class:`~rl2grid.envs.native_rows.NativeRows` plays them in compiled code, all in one call,
+:class:`~rl2grid.envs.local_rows.LocalRows` one after the other on the reference engine in this process, and
+:class:`~rl2grid.envs.remote_rows.RemoteRows` on the reference engine in other processes. :func:`make_rows` chooses.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+import os
+from dataclasses import dataclass, field
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rl2grid.envs.player import TaskPlayer
-from rl2grid.envs.tasks import TaskOptions, find_task
-from rl2grid.mdp.features import observation_size
+from rl2grid.envs.tasks import Task, TaskOptions
+from rl2grid.errors import UsageError
 
 
 @dataclass
 class Batch:
-    """What a step or reset of several rows returns, row by row."""
+    """What a step or reset of ``n`` rows returns."""
 
     observations: NDArray[np.float32]
-    """float32 [row, feature]."""
-    infos: list[dict[str, Any]]
+    """float32 [n, feature]. Those of the native engine lie in one of two buffers that take turns: they are valid until
+    the step after the next."""
     rewards: NDArray[np.float64]
-    """float64 [row]; zero after a reset."""
+    """float64 [n]; zero after a reset."""
     terminated: NDArray[np.bool_]
+    """bool [n]; False after a reset."""
     truncated: NDArray[np.bool_]
+    """bool [n]; False after a reset."""
+    infos: dict[str, Any]
+    """By key of :data:`~rl2grid.envs.info.INFO_KEYS`: arrays [n] or dicts of such. Every row has every key."""
+    endings: dict[int, dict[str, Any]] = field(default_factory=dict)
+    """By row: ``final_obs`` and ``final_info`` of the episodes that ended in this step."""
 
 
-class Rows:
-    """Some rows of a vector environment; an ended episode makes way for the next in the same step."""
+class Rows(Protocol):
+    """``n`` environments of one task, played together.
 
-    def __init__(self, task_id: str, options: TaskOptions, n: int) -> None:
-        task = find_task(task_id)
-        self._player = TaskPlayer(task, options, n)
-        self._n = n
-        self._size = observation_size(task.grid, task.kind)
-        self._n_actions = task.n_actions
+    An ended episode makes way for the next one in the same step (``AutoresetMode.SAME_STEP``).
+    """
 
     def reset(self, seeds: list[int | None], options: dict[str, Any] | None) -> Batch:
-        """Begin an episode in every row."""
-        for i, seed in enumerate(seeds):
-            self._player.reset(i, seed, options)
-        return self._batch()
+        """Begin an episode in every row: the first of its seed's stream; None: the next of its running stream.
 
-    def step(self, actions: list[Any]) -> Batch:
-        """Step every row (``AutoresetMode.SAME_STEP``): ``final_obs`` and ``final_info`` hold the ending."""
-        player = self._player
-        rewards = np.zeros(self._n)
-        terminated, truncated = np.zeros(self._n, np.bool_), np.zeros(self._n, np.bool_)
-        endings: dict[int, dict[str, Any]] = {}
-        for i, action in enumerate(actions):
-            player.step(i, action)
-            rewards[i] = player.reward(i)
-            terminated[i], truncated[i] = player.state.terminated[i], player.state.truncated[i]
-            if player.is_over(i):
-                endings[i] = {"final_obs": self._observation(i), "final_info": player.info(i)}
-                player.reset(i, None, None)
-        batch = self._batch()
-        batch.rewards, batch.terminated, batch.truncated = rewards, terminated, truncated
-        for i, ending in endings.items():
-            batch.infos[i] |= ending
-        return batch
+        Raises:
+            UsageError: an option is unknown, or names a scenario or start that does not exist.
+        """
+
+    def step(self, actions: Any) -> Batch:
+        """Step every row.
+
+        Args:
+            actions: one per row: integers [n] of a topology task, floats [n, entry] of a continuous one.
+
+        Raises:
+            UsageError: an action has the wrong shape or value, or nothing was reset yet; then no row has stepped.
+        """
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """Legal actions, bool [row, action]."""
-        masks = np.zeros((self._n, self._n_actions), np.bool_)
-        for i in range(self._n):
-            self._player.write_action_mask(i, masks[i])
-        return masks
+        """Legal actions, bool [n, action].
+
+        Raises:
+            UsageError: the task has continuous actions.
+        """
 
     def state_dict(self) -> list[dict[str, Any]]:
-        """See :meth:`rl2grid.envs.vector.PowerGridVectorEnv.state_dict`."""
-        return self._player.state_dict()
+        """By row, all that is needed to bring it back to where it is, as plain values."""
 
     def load_state_dict(self, rows: list[dict[str, Any]]) -> Batch:
-        """Bring every row to where it was."""
-        self._player.load_state_dict(rows)
-        return self._batch()
+        """Bring every row to where it was saved; the observations and infos are those of then."""
 
     def close(self) -> None:
-        """Free the simulators."""
-        self._player.close()
+        """Free the simulators and end the processes."""
 
-    def _batch(self) -> Batch:
-        observations = np.stack([self._observation(i) for i in range(self._n)])
-        infos = [self._player.info(i) for i in range(self._n)]
-        off = np.zeros(self._n, np.bool_)
-        return Batch(observations, infos, np.zeros(self._n), off, off.copy())
 
-    def _observation(self, i: int) -> NDArray[np.float32]:
-        observation = np.zeros(self._size, np.float32)
-        self._player.write_observation(i, observation)
-        return observation
+def make_rows(
+    task: Task, options: TaskOptions, n: int, *, num_threads: int | None = None, num_workers: int | None = None
+) -> Rows:
+    """``n`` rows of ``task`` on the engine of ``options``.
+
+    Args:
+        task: the task.
+        options: the keywords that the environments are made with.
+        n: number of rows.
+        num_threads: native engine: threads that share the rows; None takes one per processor core.
+        num_workers: reference engine: processes that share them; 0 plays in this one; None takes one per core.
+
+    Raises:
+        UsageError: threads for the reference engine, or processes for the native one.
+    """
+    # Each engine is imported where it is used: it loads much that the other does not need.
+    if options.engine == "native":
+        _refuse("num_workers", num_workers, "num_threads", options.engine)
+        from rl2grid.envs.native_rows import NativeRows
+
+        return NativeRows(task, options, n, num_threads)
+    _refuse("num_threads", num_threads, "num_workers", options.engine)
+    workers = min(n, os.cpu_count() or 1) if num_workers is None else min(n, num_workers)
+    if workers == 0:
+        from rl2grid.envs.local_rows import LocalRows
+
+        return LocalRows(task, options, n)
+    from rl2grid.envs.remote_rows import RemoteRows
+
+    return RemoteRows(task, options, n, workers)
+
+
+def _refuse(keyword: str, value: int | None, instead: str, engine: str) -> None:
+    if value is not None:
+        raise UsageError(f"{keyword}={value!r} is not for engine={engine!r}: give {instead}.")

@@ -16,18 +16,18 @@ import sys
 import traceback
 from typing import Any, BinaryIO
 
-from rl2grid.envs.rows import Rows
-from rl2grid.envs.tasks import TaskOptions
+from rl2grid.envs.local_rows import LocalRows
+from rl2grid.envs.tasks import Task, TaskOptions
 from rl2grid.errors import UsageError
 
 
-class RemoteRows:
-    """:class:`~rl2grid.envs.rows.Rows` in a process of its own.
+class Worker:
+    """:class:`~rl2grid.envs.local_rows.LocalRows` in a process of its own.
 
     Call a method with :meth:`send`, collect its answer with :meth:`receive`.
     """
 
-    def __init__(self, task_id: str, options: TaskOptions, n: int) -> None:
+    def __init__(self, task: Task, options: TaskOptions, n: int) -> None:
         environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
         self._process = subprocess.Popen(
             [sys.executable, "-m", "rl2grid.envs.worker"],
@@ -35,7 +35,7 @@ class RemoteRows:
             stdout=subprocess.PIPE,
             env=environment,
         )
-        self.send("make", task_id, options, n)
+        self.send("make", task, options, n)
 
     def send(self, method: str, *arguments: Any) -> None:
         """Ask for ``method(*arguments)`` without waiting."""
@@ -83,7 +83,7 @@ class RemoteRows:
 
 def serve(requests: BinaryIO, answers: BinaryIO) -> None:
     """Answer requests until they end."""
-    rows: Rows | None = None
+    rows: LocalRows | None = None
     while True:
         try:
             method, arguments = pickle.load(requests)
@@ -92,7 +92,7 @@ def serve(requests: BinaryIO, answers: BinaryIO) -> None:
         answer: tuple[str, Any] = ("done", None)
         try:
             if method == "make":
-                rows = Rows(*arguments)
+                rows = LocalRows(*arguments)
             else:
                 answer = ("done", getattr(rows, method)(*arguments))
         except UsageError as error:

@@ -1,4 +1,4 @@
-"""Several environments of one task, row by row: what the Gymnasium classes share."""
+"""Environments of one task on one engine, addressed by row: what all Gymnasium classes play."""
 
 from __future__ import annotations
 
@@ -7,28 +7,25 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from typing import TYPE_CHECKING, Any, cast
 
-import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
 from rl2grid.engines.base import Engine
 from rl2grid.engines.effects import clipping, cooldown_left, refusal
 from rl2grid.engines.transition import Transitions
+from rl2grid.envs.description import action_number
 from rl2grid.envs.info import episode_info
 from rl2grid.envs.tasks import Task, TaskOptions
 from rl2grid.errors import UsageError
-from rl2grid.grids import Grid
 from rl2grid.mdp.actions import (
     ActionKind,
     StepAction,
     action_set_hash,
-    describe,
     legal_actions,
     level_catalogue,
-    level_ids,
     validate_continuous,
 )
-from rl2grid.mdp.features import feature_slices, observation_size, observation_writer, physical_scale
+from rl2grid.mdp.features import observation_size, observation_writer, physical_scale
 from rl2grid.mdp.rewards import resolve_reward
 from rl2grid.mdp.state import GridState
 from rl2grid.scenarios.episodes import EpisodePlan, plan_episode
@@ -43,7 +40,7 @@ _RESET_OPTIONS = ("scenario", "start")
 
 
 @dataclass
-class Seat:
+class StreamPosition:
     """Where one environment is in its stream of episodes; enough to play it again."""
 
     seed: int
@@ -87,8 +84,11 @@ def make_transitions(task: Task, options: TaskOptions, n: int) -> Transitions:
     return NativeTransitions(native, options.heuristic, topology_task, reward, gamma)
 
 
-class TaskPlayer:
-    """``n`` environments of one task, addressed by row."""
+class Environments:
+    """``n`` environments of one task, addressed by row.
+
+    The single environment plays row 0 of one; :mod:`rl2grid.envs.rows` plays all rows together.
+    """
 
     def __init__(self, task: Task, options: TaskOptions, n: int) -> None:
         self.task, self.options, self.grid = task, options, task.grid
@@ -102,7 +102,7 @@ class TaskPlayer:
         self._catalogue = level_catalogue(self.grid, task.level) if task.kind == "T" else None
         self._hash = action_set_hash(self.grid, task.level) if task.kind == "T" else None
         self._plans: list[EpisodePlan | None] = [None] * n
-        self._seats: list[Seat | None] = [None] * n
+        self._positions: list[StreamPosition | None] = [None] * n
         self._pending = np.zeros(n, np.bool_)  # the episode ended inside reset, its ending is still to be returned
         self._solver: WhatIf | None = None
 
@@ -110,31 +110,34 @@ class TaskPlayer:
     def state(self) -> GridState:
         return self.engine.state
 
-    def reset(self, i: int, seed: int | None, options: dict[str, Any] | None) -> None:
+    def begin(self, i: int, seed: int | None, options: dict[str, Any] | None) -> None:
         """Begin an episode in row ``i``: the first of ``seed``'s stream, or the next one of the running stream.
 
         Raises:
             UsageError: an option is unknown, or names a scenario or start that does not exist.
         """
-        self.transitions.reset(i, self._take_seat(i, seed, options))
+        position = self._next_position(i, seed, options)
+        plan = self._plan(position)
+        self._take(i, position, plan)
+        self.transitions.reset(i, plan)
         self._pending[i] = self.is_over(i)
 
-    def step(self, i: int, action: Any) -> None:
+    def play(self, i: int, action: Any) -> None:
         """Play the agent's action and the heuristic steps to the next decision.
 
         Raises:
             UsageError: the action has the wrong shape or value, or the episode is over.
         """
-        seat = self._seat(i)
+        position = self._position(i)
         played = self._step_action(action)
         if self._pending[i]:
-            seat.actions.append(action)
+            position.actions.append(action)
             self._pending[i] = False
             return
         if self.is_over(i):
             raise UsageError("The episode is over: call reset before the next step.")
         self.transitions.play(i, played)
-        seat.actions.append(action)
+        position.actions.append(action)
 
     def is_over(self, i: int) -> bool:
         """The episode of row ``i`` was lost or completed."""
@@ -150,11 +153,11 @@ class TaskPlayer:
 
     def info(self, i: int) -> dict[str, Any]:
         """The ``info`` of row ``i``; see :data:`rl2grid.envs.info.INFO_KEYS`."""
-        plan, seat, state = self._plans[i], self._seat(i), self.state
+        plan, position, state = self._plans[i], self._position(i), self.state
         assert plan is not None
         info = {**_start_info(plan), **episode_info(state, i, self.constraint)}
         info["action_effect"] = self.transitions.effects[i]
-        info["grid_steps"] = seat.grid_steps + info["step"]
+        info["grid_steps"] = position.grid_steps + info["step"]
         info["over"] = bool(self._pending[i])
         if self.options.gamma is not None:
             info["discounted_reward"] = float(state.transition_discounted[i])
@@ -186,7 +189,7 @@ class TaskPlayer:
 
     def clock(self, i: int, step: int) -> datetime:
         """The time in the scenario after ``step`` steps of the episode of row ``i``."""
-        self._seat(i)
+        self._position(i)
         plan = self._plans[i]
         assert plan is not None
         scenario = load_scenario(self.grid.id, plan.scenario_id)
@@ -218,7 +221,7 @@ class TaskPlayer:
         played = self._catalogue[action_number(action, len(self._catalogue))]
         engine = self._native_engine(i)
         from rl2grid.engines.native.what_if import WhatIf
-        from rl2grid.envs.foresight import outages_after
+        from rl2grid.envs.outages_after_action import outages_after
 
         if self._solver is None:
             self._solver = WhatIf(self.grid, engine.environments.network)
@@ -237,66 +240,60 @@ class TaskPlayer:
             raise UsageError('A what-if is answered by the native engine only: choose engine="native".')
         return cast("NativeEngine", self.engine)
 
-    def state_dict(self) -> list[dict[str, Any]]:
-        """Everything needed to bring all rows back to where they are, as plain values."""
-        return [
-            {
-                "seed": seat.seed,
-                "number": seat.number,
-                "options": dict(seat.options),
-                "actions": [np.asarray(action).tolist() for action in seat.actions],
-                "grid_steps": seat.grid_steps,
-            }
-            for seat in self._seats
-            if seat is not None
-        ]
+    def saved_row(self, i: int) -> dict[str, Any]:
+        """Everything needed to bring row ``i`` back to where it is, as plain values."""
+        position = self._position(i)
+        return {
+            "seed": position.seed,
+            "number": position.number,
+            "options": dict(position.options),
+            "actions": [np.asarray(action).tolist() for action in position.actions],
+            "grid_steps": position.grid_steps,
+        }
 
-    def load_state_dict(self, rows: list[dict[str, Any]]) -> None:
-        """Bring row ``i`` to where ``rows[i]`` was, by playing its episode again."""
-        for i, row in enumerate(rows):
-            previous = Seat(row["seed"], row["number"] - 1, grid_steps=row["grid_steps"])
-            self._seats[i], self._plans[i] = previous, None
-            self.reset(i, None, row["options"])
-            for action in row["actions"]:
-                self.step(i, action)
+    def replay(self, i: int, saved: dict[str, Any]) -> None:
+        """Bring row ``i`` to where a row was when it was saved, by playing its episode again."""
+        previous = StreamPosition(saved["seed"], saved["number"] - 1, grid_steps=saved["grid_steps"])
+        self._positions[i], self._plans[i] = previous, None
+        self.begin(i, None, saved["options"])
+        for action in saved["actions"]:
+            self.play(i, action)
 
     def close(self) -> None:
         self.engine.close()
 
-    def _seat(self, i: int) -> Seat:
-        seat = self._seats[i]
-        if seat is None:
+    def _position(self, i: int) -> StreamPosition:
+        position = self._positions[i]
+        if position is None:
             raise UsageError("The environment was not reset yet: call reset first.")
-        return seat
+        return position
 
-    def _take_seat(self, i: int, seed: int | None, options: dict[str, Any] | None) -> EpisodePlan:
-        """Move row ``i`` to its next episode, and say which that is."""
-        seat = self._next_seat(i, seed, options or {})
-        plan = self._plan(seat)
-        self._seats[i], self._plans[i] = seat, plan
-        return plan
+    def _take(self, i: int, position: StreamPosition, plan: EpisodePlan) -> None:
+        """Move row ``i`` to an episode of its stream."""
+        self._positions[i], self._plans[i] = position, plan
 
-    def _next_seat(self, i: int, seed: int | None, options: dict[str, Any]) -> Seat:
+    def _next_position(self, i: int, seed: int | None, options: dict[str, Any] | None) -> StreamPosition:
+        options = options or {}
         for name in options:
             if name not in _RESET_OPTIONS:
                 raise UsageError(f"Reset option {name!r} does not exist: choose from {', '.join(_RESET_OPTIONS)}.")
-        previous = self._seats[i]
+        previous = self._positions[i]
         if seed is None and previous is not None:
-            # The rows of a restored seat have not been played: see load_state_dict.
+            # The rows of a restored position have not been played: see replay.
             played = previous.grid_steps + (int(self.state.step[i]) if self._plans[i] is not None else 0)
-            return Seat(previous.seed, previous.number + 1, options, grid_steps=played)
+            return StreamPosition(previous.seed, previous.number + 1, options, grid_steps=played)
         if seed is None:
             seed = int(np.random.SeedSequence().generate_state(1, np.uint64)[0] >> np.uint64(1))
-        return Seat(int(seed), 0, options)
+        return StreamPosition(int(seed), 0, options)
 
-    def _plan(self, seat: Seat) -> EpisodePlan:
+    def _plan(self, position: StreamPosition) -> EpisodePlan:
         return plan_episode(
             self.grid,
             self.options.split,
-            seat.seed,
-            seat.number,
-            scenario=seat.options.get("scenario", self.options.scenario),
-            start=seat.options.get("start"),
+            position.seed,
+            position.number,
+            scenario=position.options.get("scenario", self.options.scenario),
+            start=position.options.get("start"),
             maintenance=self.options.maintenance,
         )
 
@@ -314,71 +311,3 @@ class TaskPlayer:
 
 def _start_info(plan: EpisodePlan) -> dict[str, Any]:
     return {"scenario": plan.scenario_id, "start": plan.start, "start_redraws": plan.redraws}
-
-
-def check_action(task: Task, action: Any) -> None:
-    """Refuse an action of the wrong shape or value.
-
-    Raises:
-        UsageError: what is wrong with it and what is allowed.
-    """
-    if task.kind == "T":
-        action_number(action, task.n_actions)
-    else:
-        validate_continuous(task.grid, action)
-
-
-def action_number(action: Any, n_actions: int) -> int:
-    """A discrete action as a Python integer.
-
-    Raises:
-        UsageError: it is not an integer in 0 .. n_actions - 1.
-    """
-    array = np.asarray(action)
-    if array.shape != () or not np.issubdtype(array.dtype, np.integer) or not 0 <= int(array) < n_actions:
-        raise UsageError(f"Action {action!r} does not exist: give an integer from 0 to {n_actions - 1}.")
-    return int(array)
-
-
-def single_spaces(task: Task) -> tuple[gymnasium.spaces.Box, gymnasium.Space[Any]]:
-    """Observation and action space of one environment."""
-    size = observation_size(task.grid, task.kind)
-    observations = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
-    if task.kind == "T":
-        return observations, gymnasium.spaces.Discrete(task.n_actions)
-    return observations, gymnasium.spaces.Box(-1.0, 1.0, (task.n_actions,), np.float32)
-
-
-class TaskDescription:
-    """What the single and the vector environment say about their task."""
-
-    task: Task
-
-    @property
-    def grid(self) -> Grid:
-        """The task's grid."""
-        return self.task.grid
-
-    @property
-    def observation_slices(self) -> dict[str, slice]:
-        """Where each feature lies in an observation."""
-        return feature_slices(self.task.grid, self.task.kind)
-
-    @property
-    def action_catalogue_ids(self) -> NDArray[np.int32]:
-        """For each discrete action its id in the grid's full catalogue, int32 [action]."""
-        if self.task.kind != "T":
-            raise UsageError(f"{self.task.id} has continuous actions: only topology tasks have a catalogue.")
-        return level_ids(self.task.grid, self.task.level)
-
-    def describe_action(self, action: Any) -> str:
-        """The action in words.
-
-        Raises:
-            UsageError: the action does not exist.
-        """
-        if self.task.kind == "T":
-            catalogue = level_catalogue(self.task.grid, self.task.level)
-            return describe(self.task.grid, catalogue[action_number(action, len(catalogue))])
-        values = validate_continuous(self.task.grid, action)
-        return describe(self.task.grid, StepAction(int(ActionKind.INJECTION), values=values))

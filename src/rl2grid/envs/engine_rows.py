@@ -1,0 +1,163 @@
+"""Rows that an engine in this process plays: what does not depend on how it plays them."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rl2grid.envs.description import check_action
+from rl2grid.envs.environments import Environments, StreamPosition
+from rl2grid.envs.info import batch_info
+from rl2grid.envs.rows import Batch
+from rl2grid.envs.tasks import Task, TaskOptions
+from rl2grid.errors import UsageError
+from rl2grid.mdp.features import observation_size
+from rl2grid.scenarios.episodes import EpisodePlan
+
+I64 = NDArray[np.int64]
+Decisions = TypeVar("Decisions")
+"""Checked actions of all rows, in the form in which the engine takes them."""
+
+
+class EngineRows(Environments, ABC, Generic[Decisions]):
+    """:class:`~rl2grid.envs.environments.Environments` that are played together: :class:`~rl2grid.envs.rows.Rows`.
+
+    How rows are begun, stepped and observed is left to those who derive from it.
+    """
+
+    def __init__(self, task: Task, options: TaskOptions, n: int) -> None:
+        super().__init__(task, options, n)
+        self._n = n
+        self._size = observation_size(task.grid, task.kind)
+        self._rows = np.arange(n)
+        self._scenarios = np.full(n, "", object)
+        self._starts = np.zeros(n, np.int64)
+        self._redraws = np.zeros(n, np.int64)
+        self._earlier_steps = np.zeros(n, np.int64)  # grid steps of earlier episodes of a seed's stream
+
+    def reset(self, seeds: list[int | None], options: dict[str, Any] | None) -> Batch:
+        """See :meth:`rl2grid.envs.rows.Rows.reset`."""
+        self._begin(self._rows, seeds, options)
+        return self._batch(np.full(self._n, "", object))
+
+    def step(self, actions: Any) -> Batch:
+        """See :meth:`rl2grid.envs.rows.Rows.step`."""
+        decisions = self._decided(actions)
+        rows, waiting = self._rows, self._pending.copy()
+        if waiting.any():  # these rows return the ending that their reset has already played
+            rows = np.flatnonzero(~waiting)
+            self._pending[:] = False
+        self._play(rows, decisions)
+        effects = self._effects(decisions)
+        effects[waiting] = ""
+        state = self.state
+        rewards, terminated, truncated = state.transition_reward.copy(), state.terminated.copy(), state.truncated.copy()
+        ended = np.flatnonzero(terminated | truncated)
+        endings = {i: self._ending(i, str(effects[i])) for i in ended.tolist()}
+        if len(ended):
+            self._begin(ended, [None] * len(ended), None)
+            effects[ended] = ""
+        batch = self._batch(effects)
+        batch.rewards, batch.terminated, batch.truncated, batch.endings = rewards, terminated, truncated, endings
+        return batch
+
+    def action_masks(self) -> NDArray[np.bool_]:
+        """See :meth:`rl2grid.envs.rows.Rows.action_masks`."""
+        masks = np.zeros((self._n, self.task.n_actions), np.bool_)
+        for i in range(self._n):
+            self.write_action_mask(i, masks[i])
+        return masks
+
+    def state_dict(self) -> list[dict[str, Any]]:
+        """See :meth:`rl2grid.envs.rows.Rows.state_dict`."""
+        return [self.saved_row(i) for i in range(self._n) if self._positions[i] is not None]
+
+    def load_state_dict(self, rows: list[dict[str, Any]]) -> Batch:
+        """See :meth:`rl2grid.envs.rows.Rows.load_state_dict`."""
+        for i, saved in enumerate(rows):
+            self.replay(i, saved)
+        effects = np.empty(self._n, object)
+        effects[:] = [self.transitions.effects[i] for i in range(self._n)]
+        return self._batch(effects)
+
+    @abstractmethod
+    def _decide(self, actions: Any) -> Decisions:
+        """``actions`` of all rows, one each, checked.
+
+        Raises:
+            UsageError: one has the wrong shape or value.
+        """
+
+    @abstractmethod
+    def _play(self, rows: I64, decisions: Decisions) -> None:
+        """Play one transition in each of ``rows``."""
+
+    @abstractmethod
+    def _effects(self, decisions: Decisions) -> NDArray[np.object_]:
+        """What became of the actions that were played last, object [n]."""
+
+    @abstractmethod
+    def _start(self, rows: list[int], plans: list[EpisodePlan]) -> None:
+        """Begin episodes in ``rows`` and play to their first decisions."""
+
+    @abstractmethod
+    def _observations(self) -> NDArray[np.float32]:
+        """The observations of all rows, float32 [n, feature]."""
+
+    def _begin(self, rows: I64, seeds: list[int | None], options: dict[str, Any] | None) -> None:
+        # All or none: no row may have begun when another's options are refused.
+        numbers = rows.tolist()
+        positions = [self._next_position(i, seed, options) for i, seed in zip(numbers, seeds, strict=True)]
+        plans = [self._plan(position) for position in positions]
+        for i, position, plan in zip(numbers, positions, plans, strict=True):
+            self._take(i, position, plan)
+        self._start(numbers, plans)
+        self._pending[rows] = self.state.terminated[rows] | self.state.truncated[rows]
+
+    def _take(self, i: int, position: StreamPosition, plan: EpisodePlan) -> None:
+        super()._take(i, position, plan)
+        self._scenarios[i], self._starts[i], self._earlier_steps[i] = plan.scenario_id, plan.start, position.grid_steps
+        self._redraws[i] = plan.redraws
+
+    def _decided(self, actions: Any) -> Decisions:
+        """The actions of all rows, checked, and noted in the rows' positions."""
+        positions = [self._position(i) for i in range(self._n)]
+        given = len(actions) if hasattr(actions, "__len__") else 1
+        if given != self._n:
+            raise UsageError(f"{given} actions were given for {self._n} environments: give one each.")
+        decisions = self._decide(actions)
+        history = np.array(actions, np.float32) if self._catalogue is None else np.asarray(actions).tolist()
+        for position, action in zip(positions, history, strict=True):
+            position.actions.append(action)
+        return decisions
+
+    def _check(self, actions: Any) -> None:
+        """Say what is wrong with the first wrong action."""
+        for action in actions:
+            check_action(self.task, action)
+
+    def _ending(self, i: int, effect: str) -> dict[str, Any]:
+        observation = np.zeros(self._size, np.float32)
+        self.write_observation(i, observation)
+        self.transitions.effects[i] = effect
+        return {"final_obs": observation, "final_info": self.info(i)}
+
+    def _batch(self, effects: NDArray[np.object_]) -> Batch:
+        infos = {
+            "scenario": self._scenarios.copy(),
+            "start": self._starts.copy(),
+            "start_redraws": self._redraws.copy(),
+            **batch_info(self.state, self.constraint),
+            "action_effect": effects,
+        }
+        infos["grid_steps"] = self._earlier_steps + infos["step"]
+        infos["over"] = self._pending.copy()
+        if self.options.gamma is not None:
+            infos["discounted_reward"] = self.state.transition_discounted.copy()
+        if self._hash is not None:
+            infos["action_set_hash"] = np.full(self._n, self._hash, object)
+        off = np.zeros(self._n, np.bool_)
+        return Batch(self._observations(), np.zeros(self._n), off, off.copy(), infos)

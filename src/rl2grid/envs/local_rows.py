@@ -1,0 +1,39 @@
+"""Rows on the reference engine in this process, played one after the other."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rl2grid.envs.engine_rows import I64, EngineRows
+from rl2grid.mdp.actions import StepAction
+from rl2grid.scenarios.episodes import EpisodePlan
+
+
+class LocalRows(EngineRows[list[StepAction]]):
+    """:class:`~rl2grid.envs.rows.Rows` that need Python at every step."""
+
+    def _decide(self, actions: Any) -> list[StepAction]:
+        self._check(actions)
+        return [self._step_action(action) for action in actions]
+
+    def _play(self, rows: I64, decisions: list[StepAction]) -> None:
+        for i in rows.tolist():
+            self.transitions.play(i, decisions[i])
+
+    def _effects(self, decisions: list[StepAction]) -> NDArray[np.object_]:
+        effects = np.empty(self._n, object)
+        effects[:] = [self.transitions.effects[i] for i in range(self._n)]
+        return effects
+
+    def _start(self, rows: list[int], plans: list[EpisodePlan]) -> None:
+        for i, plan in zip(rows, plans, strict=True):
+            self.transitions.reset(i, plan)
+
+    def _observations(self) -> NDArray[np.float32]:
+        observations = np.zeros((self._n, self._size), np.float32)
+        for i in range(self._n):
+            self.write_observation(i, observations[i])
+        return observations

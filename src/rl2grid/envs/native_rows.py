@@ -1,0 +1,76 @@
+"""Rows on the native engine, played together in compiled code."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rl2grid.engines.native.transitions import Commands, NativeTransitions
+from rl2grid.envs.engine_rows import I64, EngineRows
+from rl2grid.envs.tasks import Task, TaskOptions
+from rl2grid.mdp.actions import ActionKind
+from rl2grid.scenarios.episodes import EpisodePlan
+
+
+class NativeRows(EngineRows[Commands]):
+    """:class:`~rl2grid.envs.rows.Rows` that play all of them in one call."""
+
+    transitions: NativeTransitions
+
+    def __init__(self, task: Task, options: TaskOptions, n: int, num_threads: int | None) -> None:
+        super().__init__(task, options, n)
+        self._num_threads = num_threads or os.cpu_count() or 1
+        self._buffers = [np.zeros((n, self._size), np.float32) for _ in range(2)]
+
+    def _decide(self, actions: Any) -> Commands:
+        return self._continuous(actions) if self._catalogue is None else self._discrete(actions)
+
+    def _play(self, rows: I64, decisions: Commands) -> None:
+        self.transitions.play_rows(rows, decisions.take(rows), self._num_threads)
+
+    def _effects(self, decisions: Commands) -> NDArray[np.object_]:
+        return self.transitions.effects_of(decisions)
+
+    def _start(self, rows: list[int], plans: list[EpisodePlan]) -> None:
+        if not self.transitions.is_compiled:
+            for i, plan in zip(rows, plans, strict=True):
+                self.transitions.reset(i, plan)
+            return
+        for i, plan in zip(rows, plans, strict=True):
+            self.transitions.engine.prepare(i, plan)
+            self.transitions.effects[i] = ""
+        self.transitions.begin_rows(np.array(rows), self._num_threads)
+
+    def _observations(self) -> NDArray[np.float32]:
+        self._buffers.reverse()
+        self.transitions.write_observations(self._rows, *self._normaliser, self._buffers[0])
+        return self._buffers[0]
+
+    def _discrete(self, actions: Any) -> Commands:
+        assert self._catalogue is not None
+        numbers = np.asarray(actions)
+        valid = numbers.shape == (self._n,) and np.issubdtype(numbers.dtype, np.integer)
+        if not valid or numbers.min() < 0 or numbers.max() >= len(self._catalogue):
+            self._check(actions)
+        kinds, targets, masks = self._catalogue.kind, self._catalogue.target, self._catalogue.mask
+        return Commands(
+            kinds[numbers].astype(np.int64),
+            targets[numbers].astype(np.int64),
+            masks[numbers].astype(np.int64),
+            np.zeros((self._n, 0), np.float32),
+        )
+
+    def _continuous(self, actions: Any) -> Commands:
+        try:
+            values = np.array(actions, np.float32, order="C")
+        except (TypeError, ValueError):
+            self._check(actions)
+            raise
+        # NaN compares as false.
+        if values.shape != (self._n, self.task.n_actions) or not (np.abs(values) <= 1).all():
+            self._check(actions)
+        zeros = np.zeros(self._n, np.int64)
+        return Commands(np.full(self._n, int(ActionKind.INJECTION)), zeros, zeros, values)

@@ -1,0 +1,101 @@
+"""Rows on the reference engine, shared by several processes."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rl2grid.envs.description import check_action
+from rl2grid.envs.rows import Batch
+from rl2grid.envs.tasks import Task, TaskOptions
+from rl2grid.envs.worker import Worker
+from rl2grid.errors import UsageError
+
+
+class RemoteRows:
+    """:class:`~rl2grid.envs.rows.Rows` of which every process plays a part, all processes at once."""
+
+    def __init__(self, task: Task, options: TaskOptions, n: int, num_workers: int) -> None:
+        self._task, self._n = task, n
+        bounds = np.linspace(0, n, num_workers + 1).astype(int).tolist()
+        self._parts = [slice(first, last) for first, last in itertools.pairwise(bounds)]
+        self._workers = [Worker(task, options, part.stop - part.start) for part in self._parts]
+        try:
+            for worker in self._workers:
+                worker.receive()
+        except BaseException:
+            self.close()
+            raise
+
+    def reset(self, seeds: list[int | None], options: dict[str, Any] | None) -> Batch:
+        """See :meth:`rl2grid.envs.rows.Rows.reset`."""
+        return self._together(self._ask("reset", [(seeds[part], options) for part in self._parts]))
+
+    def step(self, actions: Any) -> Batch:
+        """See :meth:`rl2grid.envs.rows.Rows.step`."""
+        rows = list(actions)
+        if len(rows) != self._n:
+            raise UsageError(f"{len(rows)} actions were given for {self._n} environments: give one each.")
+        for action in rows:  # all or none: no worker may have stepped when another's action is refused
+            check_action(self._task, action)
+        return self._together(self._ask("step", [(rows[part],) for part in self._parts]))
+
+    def action_masks(self) -> NDArray[np.bool_]:
+        """See :meth:`rl2grid.envs.rows.Rows.action_masks`."""
+        return np.concatenate(self._ask("action_masks", [() for _ in self._parts]))
+
+    def state_dict(self) -> list[dict[str, Any]]:
+        """See :meth:`rl2grid.envs.rows.Rows.state_dict`."""
+        return [row for part in self._ask("state_dict", [() for _ in self._parts]) for row in part]
+
+    def load_state_dict(self, rows: list[dict[str, Any]]) -> Batch:
+        """See :meth:`rl2grid.envs.rows.Rows.load_state_dict`."""
+        return self._together(self._ask("load_state_dict", [(rows[part],) for part in self._parts]))
+
+    def close(self) -> None:
+        """End the processes."""
+        for worker in self._workers:
+            worker.close()
+
+    def _ask(self, method: str, arguments: list[tuple[Any, ...]]) -> list[Any]:
+        """Call ``method`` of every worker, all at once."""
+        for worker, part in zip(self._workers, arguments, strict=True):
+            worker.send(method, *part)
+        answers, failure = [], None
+        for worker in self._workers:
+            try:
+                answers.append(worker.receive())
+            except Exception as error:  # the other workers' answers must be collected all the same
+                failure = error
+        if failure is not None:
+            raise failure
+        return answers
+
+    def _together(self, batches: list[Batch]) -> Batch:
+        """The batches of all workers as that of all rows."""
+        endings = {
+            part.start + i: ending
+            for part, batch in zip(self._parts, batches, strict=True)
+            for i, ending in batch.endings.items()
+        }
+        return Batch(
+            np.concatenate([batch.observations for batch in batches]),
+            np.concatenate([batch.rewards for batch in batches]),
+            np.concatenate([batch.terminated for batch in batches]),
+            np.concatenate([batch.truncated for batch in batches]),
+            _joined([batch.infos for batch in batches]),
+            endings,
+        )
+
+
+def _joined(infos: list[dict[str, Any]]) -> dict[str, Any]:
+    """Infos of parts of the rows as those of all."""
+    return {
+        key: _joined([info[key] for info in infos])
+        if isinstance(value, dict)
+        else np.concatenate([info[key] for info in infos])
+        for key, value in infos[0].items()
+    }
