@@ -228,7 +228,7 @@ def test_ppo_advantages_whatever_ends_the_episodes(seed: int, continuous: bool):
         torch.as_tensor(column).reshape(NUM_ENVS, NUM_STEPS).T
         for column in (theirs.rollout_buffer.advantages, theirs.rollout_buffer.returns)
     )
-    our_advantages = ppo.generalized_advantages(rollout, ours.args.gae_lambda)
+    our_advantages = ppo.advantages_of_rewards(rollout, ours.args.gae_lambda)
     agree(our_advantages, advantages)
     agree(our_advantages + rollout.values, returns)
 
@@ -258,7 +258,7 @@ def random_rollout(ours: ppo.PPO, seed: int) -> ppo.Rollout:
 
 def minibatch_of(rollout: ppo.Rollout) -> ppo.Minibatch:
     """All of it."""
-    advantages = ppo.generalized_advantages(rollout, 0.9)
+    advantages = ppo.advantages_of_rewards(rollout, 0.9)
     return ppo.Minibatch(
         rollout.observations.flatten(0, 1),
         None,
@@ -337,7 +337,7 @@ def test_lagrangian_ppo_without_a_price_has_the_losses_of_ppo(seed: int, continu
     lagrangian = lagrangian_ppo.ActorCritic(
         OBSERVATION_SIZE,
         ACTION_SIZE,
-        n_constraints=2,
+        n_costs=2,
         continuous=continuous,
         actor_layers=(8, 8),
         critic_layers=(8,),
@@ -347,7 +347,9 @@ def test_lagrangian_ppo_without_a_price_has_the_losses_of_ppo(seed: int, continu
     args = lagrangian_ppo.Args(normalize_advantages=False, mask_actions=False, clip_coefficient=0.2)
     advantages = lagrangian_ppo.lagrangian_advantages(batch.advantages, costs, torch.zeros(2))
     loss = lagrangian_ppo.losses(
-        lagrangian, lagrangian_ppo.Minibatch(*batch[:5], advantages, batch.returns, costs, costs), args
+        lagrangian,
+        lagrangian_ppo.Minibatch(**{**vars(batch), "advantages": advantages}, cost_values=costs, cost_returns=costs),
+        args,
     )
     record = train_theirs(theirs, batch)
     agree(loss.policy, record["train/policy_gradient_loss"])

@@ -22,7 +22,7 @@ import toy_grid
 from torch import Tensor
 from torch.fx.experimental import _config as shapes
 
-from rl2grid.algorithms import lagrangian_ppo, off_policy, ppo
+from rl2grid.algorithms import trainer
 from rl2grid.algorithms.devices import find_device
 from rl2grid.errors import UsageError
 
@@ -54,8 +54,7 @@ def on_meta(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     answer("__float__", lambda tensor: 0.0)
     answer("__bool__", lambda tensor: False)
     answer("tolist", lambda tensor: torch.zeros(tensor.shape).tolist())
-    for module in (off_policy, ppo, lagrangian_ppo):
-        monkeypatch.setattr(module, "find_device", lambda name: torch.device("meta"))
+    monkeypatch.setattr(trainer, "find_device", lambda name: torch.device("meta"))
     monkeypatch.setattr(toy_grid.Row, "mask", lambda self: np.ones(toy_grid.N_ACTIONS, np.bool_))
     with shapes.patch(meta_nonzero_assume_all_nonzero=True):
         yield
@@ -64,16 +63,15 @@ def on_meta(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 @pytest.mark.usefixtures("on_meta")
 @pytest.mark.parametrize("name", TRAINERS)
 def test_tensors_of_two_devices_never_meet(name: str):
-    trainer = TRAINERS[name]()
-    while not trainer.finished:
-        metrics = trainer.iterate()
+    learner = TRAINERS[name]()
+    while not learner.finished:
+        metrics = learner.iterate()
     assert any(key.startswith("losses/") for key in metrics), "nothing was learned"
-    assert {parameter.device.type for parameter in parameters(trainer)} == {"meta"}
+    assert {parameter.device.type for parameter in parameters(learner)} == {"meta"}
 
 
-def parameters(trainer: Any) -> list[Tensor]:
-    network = trainer.policy()[0] if isinstance(trainer, off_policy.OffPolicyTrainer) else trainer.network
-    return list(network.parameters())
+def parameters(learner: Any) -> list[Tensor]:
+    return list(learner.policy()[0].parameters())
 
 
 def test_a_gpu_is_taken_if_there_is_one_and_refused_if_not(monkeypatch: pytest.MonkeyPatch):

@@ -27,12 +27,12 @@ from rl2grid.algorithms.lagrangian_ppo import (
     Multipliers,
     Rollout,
     advantages_of_costs,
-    advantages_of_rewards,
     lagrangian_advantages,
     load_policy,
     losses,
     preset,
 )
+from rl2grid.algorithms.on_policy import advantages_of_rewards
 from rl2grid.algorithms.policy_agent import PolicyAgent
 from rl2grid.envs.registration import register_all
 from rl2grid.errors import UsageError
@@ -63,10 +63,10 @@ def trainer(continuous: bool = False, **changes: Any) -> LagrangianPPO:
     return LagrangianPPO(args, CostlyToyGrid(args.num_envs, continuous=continuous))
 
 
-def first_rollout(learner: LagrangianPPO) -> tuple[Rollout, NDArray[np.float64], dict[str, float]]:
-    """The rollout before any update, and what was found out about its episodes."""
+def first_rollout(learner: LagrangianPPO) -> Rollout:
+    """The rollout before any update."""
     learner._observations, _ = learner.envs.reset(seed=7)
-    return learner.collect()
+    return learner.collect()[0]
 
 
 def weights(learner: LagrangianPPO) -> dict[str, Tensor]:
@@ -243,7 +243,8 @@ def test_advantages_are_the_discounted_errors_until_the_end_of_the_episode(gae_l
 
 def test_advantages_of_costs_of_several_grid_steps_by_hand():
     # Transitions of 3 and 2 grid steps, cost_gamma 0.5, lambda 0.8, the second one completes the month.
-    rollout = random_rollout(2, 1)._replace(
+    rollout = replace(
+        random_rollout(2, 1),
         costs=torch.tensor([[[4.0]], [[2.0]]]),
         cost_discounts=torch.tensor([[0.125], [0.25]]),
         cost_values=torch.tensor([[[1.0]], [[3.0]]]),
@@ -273,7 +274,7 @@ def test_costs_bootstrap_by_how_the_episode_ended():
     envs = Recording(4)
     args = replace(SMALL, num_steps=200, total_timesteps=800, normalize_observations=False)
     learner = LagrangianPPO(args, envs)
-    rollout, _, _ = first_rollout(learner)
+    rollout = first_rollout(learner)
     counts = {"terminated": 0, "truncated": 0, "running": 0}
     for k, (observations, _, terminated, truncated, infos) in enumerate(envs.answers):
         for i in range(4):
@@ -295,7 +296,7 @@ def test_costs_of_all_grid_steps_of_a_transition_count():
     """Those of heuristic steps and of the last step of an episode, too."""
     envs = Recording(4)
     learner = LagrangianPPO(replace(SMALL, num_steps=60, total_timesteps=240), envs)
-    rollout, _, _ = first_rollout(learner)
+    rollout = first_rollout(learner)
     charged = {"LSI": 0, "TLO": 0}
     for k, (_, _, terminated, truncated, infos) in enumerate(envs.answers):
         for i in range(4):
@@ -312,10 +313,10 @@ def test_costs_of_all_grid_steps_of_a_transition_count():
 
 def test_the_cost_scale_touches_critics_only():
     plain, scaled = trainer(cost_scale=1.0), trainer(cost_scale=3.0)
-    one, one_costs, _ = first_rollout(plain)
-    other, other_costs, _ = first_rollout(scaled)
+    one, other = first_rollout(plain), first_rollout(scaled)
     torch.testing.assert_close(other.costs, 3.0 * one.costs)
-    np.testing.assert_array_equal(one_costs, other_costs)
+    assert len(plain.account.costs) > 2
+    np.testing.assert_array_equal(plain.account.costs, scaled.account.costs)
 
 
 # --- Policies and losses --------------------------------------------------------------------------------------------
@@ -325,7 +326,7 @@ def policy(*, continuous: bool, n_constraints: int = 2) -> ActorCritic:
     network = ActorCritic(
         4,
         2 if continuous else 3,
-        n_constraints=n_constraints,
+        n_costs=n_constraints,
         continuous=continuous,
         actor_layers=(8,),
         critic_layers=(8,),
@@ -381,7 +382,7 @@ class Scripted(ActorCritic):
         super().__init__(
             1,
             2,
-            n_constraints=1,
+            n_costs=1,
             continuous=False,
             actor_layers=(),
             critic_layers=(),
@@ -444,7 +445,7 @@ def test_clipped_value_losses_by_hand():
 @BOTH
 def test_the_ratio_before_any_update_is_one(continuous: bool):
     learner = trainer(continuous)
-    rollout, _, _ = first_rollout(learner)
+    rollout = first_rollout(learner)
     masks = None if rollout.masks is None else rollout.masks.flatten(0, 1)
     now, _ = learner.network.log_probability_and_entropy(
         rollout.observations.flatten(0, 1), rollout.actions.flatten(0, 1), masks
@@ -519,8 +520,8 @@ def test_the_costly_action_becomes_rarer_when_rewards_do_not_care():
     learner = LagrangianPPO(chain_args(), Chain(16))
     before = risks(learner)
     for _ in range(20):
-        rollout, _, _ = first_rollout(learner)
-        silent = rollout._replace(rewards=torch.zeros_like(rollout.rewards))
+        rollout = first_rollout(learner)
+        silent = replace(rollout, rewards=torch.zeros_like(rollout.rewards))
         learner.multipliers = multipliers(1.0)
         learner.update(silent)
     np.testing.assert_allclose(before, 0.5, atol=0.02)
@@ -613,7 +614,7 @@ def test_a_resumed_run_ends_with_the_weights_of_one_that_was_not_interrupted(con
         assert_same(weights(resumed), weights(straight))
         for mine, theirs in zip(resumed.multipliers, straight.multipliers, strict=True):
             np.testing.assert_array_equal(mine, theirs)
-        np.testing.assert_array_equal(resumed._episode_costs, straight._episode_costs)
+        np.testing.assert_array_equal(resumed.account.running, straight.account.running)
         assert resumed.envs.normaliser_hash == straight.envs.normaliser_hash  # type: ignore[attr-defined]
         for name in metrics.keys() - {"charts/environment_share"}:
             assert metrics[name] == straight_metrics[-1][name], name
@@ -646,9 +647,9 @@ def test_everything_is_optimised_and_saved(tmp_path: Path):
 
 def test_transitions_that_no_decision_began_teach_nothing():
     learner = trainer()
-    rollout, _, _ = first_rollout(learner)
+    rollout = first_rollout(learner)
     before = weights(learner)
-    metrics = learner.update(rollout._replace(decided=torch.zeros_like(rollout.decided)))
+    metrics = learner.update(replace(rollout, decided=torch.zeros_like(rollout.decided)))
     assert_same(weights(learner), before)
     assert math.isnan(metrics["losses/cost_value_loss_TLO"])
 

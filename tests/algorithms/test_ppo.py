@@ -24,7 +24,7 @@ from rl2grid.algorithms.ppo import (
     Args,
     Minibatch,
     Rollout,
-    generalized_advantages,
+    advantages_of_rewards,
     load_policy,
     losses,
     preset,
@@ -134,7 +134,7 @@ def advantage_by_definition(rollout: Rollout, k: int, i: int, gae_lambda: float)
 @pytest.mark.parametrize("gae_lambda", [0.0, 0.7, 1.0])
 def test_advantages_are_the_discounted_errors_until_the_end_of_the_episode(gae_lambda: float):
     rollout = random_rollout()
-    advantages = generalized_advantages(rollout, gae_lambda)
+    advantages = advantages_of_rewards(rollout, gae_lambda)
     for k in range(advantages.shape[0]):
         for i in range(advantages.shape[1]):
             expected = advantage_by_definition(rollout, k, i, gae_lambda)
@@ -143,14 +143,15 @@ def test_advantages_are_the_discounted_errors_until_the_end_of_the_episode(gae_l
 
 def test_advantages_of_transitions_of_several_grid_steps_by_hand():
     # Two transitions of 3 and 2 grid steps, gamma 0.5, lambda 0.8, the second one completes the month.
-    rollout = random_rollout(2, 1)._replace(
+    rollout = replace(
+        random_rollout(2, 1),
         rewards=torch.tensor([[4.0], [2.0]]),
         discounts=torch.tensor([[0.125], [0.25]]),
         values=torch.tensor([[1.0], [3.0]]),
         next_values=torch.tensor([[3.0], [8.0]]),
         ended=torch.tensor([[False], [True]]),
     )
-    advantages = generalized_advantages(rollout, 0.8)
+    advantages = advantages_of_rewards(rollout, 0.8)
     last = 2.0 + 0.25 * 8.0 - 3.0
     assert advantages.squeeze(1).tolist() == pytest.approx([4.0 + 0.125 * 3.0 - 1.0 + 0.125 * 0.8 * last, last])
 
@@ -243,11 +244,11 @@ def test_transitions_that_no_decision_began_teach_nothing():
     chosen[::2] = True
     nonsense = torch.full_like(rollout.log_probabilities, math.nan)
     ppo.update(
-        rollout._replace(decided=chosen, log_probabilities=torch.where(chosen, rollout.log_probabilities, nonsense))
+        replace(rollout, decided=chosen, log_probabilities=torch.where(chosen, rollout.log_probabilities, nonsense))
     )
     assert all(torch.isfinite(tensor).all() for tensor in weights(ppo).values())
     before = weights(ppo)
-    metrics = ppo.update(rollout._replace(decided=torch.zeros_like(chosen)))
+    metrics = ppo.update(replace(rollout, decided=torch.zeros_like(chosen)))
     assert_same(weights(ppo), before)
     assert math.isnan(metrics["losses/policy_loss"])
 

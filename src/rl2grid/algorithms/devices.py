@@ -8,11 +8,9 @@ import torch
 
 from rl2grid.errors import UsageError
 
-DEVICES = ("auto", "cpu", "cuda")
-
 
 def find_device(name: str) -> torch.device:
-    """The device called ``name``, one of :data:`DEVICES`, set up so that PyTorch can compute the same every time.
+    """The device called ``name`` (``auto``, ``cpu``, ``cuda``), set up so that PyTorch computes the same every time.
 
     Raises:
         UsageError: a GPU is asked for and PyTorch finds none.

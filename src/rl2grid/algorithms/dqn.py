@@ -1,4 +1,4 @@
-"""Double deep Q-learning (Mnih et al., 2015; van Hasselt et al., 2016) for topology tasks, in one file.
+"""Double deep Q-learning (Mnih et al., 2015; van Hasselt et al., 2016) for topology tasks.
 
 Targets
     What is played, remembered and when there is an update is in :mod:`rl2grid.algorithms.off_policy`. One
@@ -28,13 +28,14 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
 from gymnasium.vector import VectorEnv
 from torch import Tensor, nn
 
+from rl2grid.algorithms.hyperparameters import changed_preset
 from rl2grid.algorithms.off_policy import (
     ILLEGAL,
     Batch,
@@ -163,9 +164,7 @@ def preset(name: str, *, continuous: bool, **changes: Any) -> Args:
     Raises:
         UsageError: no such preset, values that cannot work, or continuous actions.
     """
-    if name not in PRESETS:
-        raise one_of("DQN's preset", name, tuple(PRESETS))
-    return replace(PRESETS[name](continuous=continuous), **changes)
+    return changed_preset(PRESETS, "DQN", name, continuous=continuous, **changes)
 
 
 def _refuse_continuous(continuous: bool) -> None:

@@ -1,4 +1,4 @@
-"""Soft actor-critic (Haarnoja et al., 2018; Christodoulou, 2019) for topology and redispatching tasks, in one file.
+"""Soft actor-critic (Haarnoja et al., 2018; Christodoulou, 2019) for topology and redispatching tasks.
 
 What is played, remembered and when there is an update is in :mod:`rl2grid.algorithms.off_policy`.
 
@@ -37,13 +37,14 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import torch
 from gymnasium.vector import VectorEnv
 from torch import Tensor, nn
 
+from rl2grid.algorithms.hyperparameters import changed_preset
 from rl2grid.algorithms.off_policy import (
     ILLEGAL,
     Batch,
@@ -55,7 +56,6 @@ from rl2grid.algorithms.off_policy import (
     make_network,
     random_legal_actions,
 )
-from rl2grid.errors import UsageError, one_of
 
 # --- Hyperparameters ------------------------------------------------------------------------------------------------
 
@@ -103,8 +103,7 @@ class Args(OffPolicyArgs):
         self._check_positive("tau", "initial_temperature")
         self._check_shares("tau", "first_entropy_share", "last_entropy_share")
         self._check_layers("actor_layers", "critic_layers")
-        if self.initial_do_nothing is not None and not 0.0 < self.initial_do_nothing < 1.0:
-            raise UsageError(f"SAC needs initial_do_nothing above 0 and below 1, not {self.initial_do_nothing}.")
+        self._check_probability("initial_do_nothing")
 
 
 def default(*, continuous: bool) -> Args:
@@ -169,9 +168,7 @@ def preset(name: str, *, continuous: bool, **changes: Any) -> Args:
     Raises:
         UsageError: no such preset, or values that cannot work.
     """
-    if name not in PRESETS:
-        raise one_of("SAC's preset", name, tuple(PRESETS))
-    return replace(PRESETS[name](continuous=continuous), **changes)
+    return changed_preset(PRESETS, "SAC", name, continuous=continuous, **changes)
 
 
 # --- Networks -------------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Twin delayed deep deterministic policy gradient (Fujimoto et al., 2018) for redispatching tasks, in one file.
+"""Twin delayed deep deterministic policy gradient (Fujimoto et al., 2018) for redispatching tasks.
 
 What is played, remembered and when there is an update is in :mod:`rl2grid.algorithms.off_policy`.
 
@@ -20,13 +20,14 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
 from gymnasium.vector import VectorEnv
 from torch import Tensor, nn
 
+from rl2grid.algorithms.hyperparameters import changed_preset
 from rl2grid.algorithms.off_policy import (
     Batch,
     OffPolicyArgs,
@@ -36,7 +37,7 @@ from rl2grid.algorithms.off_policy import (
     follow,
     make_network,
 )
-from rl2grid.errors import UsageError, one_of
+from rl2grid.errors import UsageError
 
 # --- Hyperparameters ------------------------------------------------------------------------------------------------
 
@@ -134,9 +135,7 @@ def preset(name: str, *, continuous: bool, **changes: Any) -> Args:
     Raises:
         UsageError: no such preset, values that cannot work, or discrete actions.
     """
-    if name not in PRESETS:
-        raise one_of("TD3's preset", name, tuple(PRESETS))
-    return replace(PRESETS[name](continuous=continuous), **changes)
+    return changed_preset(PRESETS, "TD3", name, continuous=continuous, **changes)
 
 
 def _refuse_discrete(continuous: bool) -> None:

@@ -1,0 +1,483 @@
+"""What PPO and Lagrangian PPO have in common: playing a rollout and learning from it in minibatches. What they learn is
+in their own files.
+
+Advantages
+    Of transitions of varying length (:mod:`rl2grid.algorithms.trainer`), generalised advantage estimation
+    (Schulman et al., 2016) reads
+
+        delta_k = R_k + gamma^{n_k} V_{k+1} - V(s_k)
+        A_k     = delta_k + gamma^{n_k} lambda A_{k+1}             (lambda decays per decision)
+
+    The critic is fitted to A_k + V(s_k). Where an episode ends, A_{k+1} = 0. V_{k+1} = 0 if it was
+    terminated (game over); if it was truncated (month completed) V_{k+1} is the value of its last
+    observation, because the grid would have gone on. The next episode's first observation never enters.
+
+Policies
+    Discrete: a categorical distribution; with masks, illegal actions have probability zero, and the
+    entropy is that of the legal ones. Continuous: a diagonal Gaussian whose log standard deviations are
+    trained, one per dimension, the same in all states. The environment is given the sample clipped into
+    [-1, 1]; log-probabilities are those of the sample before clipping, so clipping belongs to the
+    environment and the ratio of probabilities is exact. The deterministic action is the most probable
+    one, or the clipped mean.
+
+Randomness and devices
+    Minibatches are drawn from the generator of :mod:`rl2grid.algorithms.trainer` as well. The networks and a
+    rollout live on ``Args.device``; environments, normalisation and all random draws stay on the CPU, so that a
+    checkpoint made on one device can be resumed on another. Results are the same bit by bit on one kind of
+    device, not across kinds.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, Self
+
+import numpy as np
+import torch
+from gymnasium.vector import VectorEnv
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from rl2grid.algorithms.diagnostics import mean
+from rl2grid.algorithms.hyperparameters import SharedArgs
+from rl2grid.algorithms.playing import Tally
+from rl2grid.algorithms.trainer import Played, Trainer
+from rl2grid.envs.normalization import NormalizeObservation
+
+# --- Hyperparameters ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class OnPolicyArgs(SharedArgs):
+    """Hyperparameters that the algorithms share."""
+
+    num_steps: int = 64
+    """Decisions per environment between two updates."""
+    gae_lambda: float = 0.95
+    """Decay of advantage estimates per decision; 0 trusts the critic alone, 1 the returns alone."""
+    actor_learning_rate: float = 3e-4
+    """Adam's step size for the policy."""
+    critic_learning_rate: float = 3e-4
+    """Adam's step size for every value function."""
+    anneal_learning_rate: bool = True
+    """Whether both step sizes fall linearly to zero over the run."""
+    num_minibatches: int = 4
+    """Parts into which the transitions of an update are split at random, in every epoch anew."""
+    update_epochs: int = 10
+    """Passes over the transitions of an update."""
+    max_grad_norm: float = 0.5
+    """Gradients of the actor, and those of each critic, are scaled down to this norm when longer."""
+    target_kl: float | None = 0.03
+    """An update ends after the epoch in which the approximate KL divergence passes this; None: never early."""
+    actor_layers: tuple[int, ...] = (128, 128)
+    """Widths of the policy's hidden layers (tanh)."""
+    critic_layers: tuple[int, ...] = (128, 128)
+    """Widths of every value function's hidden layers (tanh)."""
+    initial_do_nothing: float | None = None
+    """Discrete actions only: probability of action 0 before training; None: all actions are about alike."""
+    initial_log_std: float = -1.0
+    """Continuous actions only: where the trained log standard deviations start."""
+
+    def __post_init__(self) -> None:
+        """Refuse values that cannot work; see :class:`SharedArgs`."""
+        super().__post_init__()
+        self._check_counts("num_minibatches", "update_epochs")
+        self._check_shares("gae_lambda")
+        self._check_positive("actor_learning_rate", "critic_learning_rate")
+        self._check_layers("actor_layers", "critic_layers")
+        self._check_probability("initial_do_nothing")
+
+
+# --- Networks -------------------------------------------------------------------------------------------------------
+
+_ILLEGAL_LOGIT = -1e8
+"""Probability exactly zero in float32, and yet finite, so that zero times its logarithm is zero."""
+
+
+class ActorCritic(nn.Module):
+    """The policy, the value function, and a value function of every cost: separate tanh networks."""
+
+    def __init__(
+        self,
+        observation_size: int,
+        action_size: int,
+        *,
+        continuous: bool,
+        actor_layers: Sequence[int],
+        critic_layers: Sequence[int],
+        initial_log_std: float,
+        n_costs: int = 0,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        """``action_size``: number of discrete actions, or dimensions of the continuous action."""
+        super().__init__()
+        self.observation_size = observation_size
+        self.action_size = action_size
+        self.continuous = continuous
+        self.actor = _network(observation_size, actor_layers, action_size, 0.01, generator)
+        self.critic = _network(observation_size, critic_layers, 1, 1.0, generator)
+        self.cost_critics = nn.ModuleList(
+            _network(observation_size, critic_layers, 1, 1.0, generator) for _ in range(n_costs)
+        )
+        if continuous:
+            self.log_std = nn.Parameter(torch.full((action_size,), initial_log_std))
+
+    def prefer_first_action(self, probability: float) -> None:
+        """Shift the last layer so that action 0 has about this probability in every state."""
+        last = self.actor[-1]
+        assert isinstance(last, nn.Linear)
+        with torch.no_grad():
+            last.bias[0] = math.log(probability / (1.0 - probability) * (self.action_size - 1))
+
+    def actor_parameters(self) -> list[nn.Parameter]:
+        """Everything that the policy depends on, the log standard deviations included."""
+        return list(self.actor.parameters()) + ([self.log_std] if self.continuous else [])
+
+    def value(self, observations: Tensor) -> Tensor:
+        """V of observations [batch, size] -> [batch]."""
+        values: Tensor = self.critic(observations)
+        return values.squeeze(-1)
+
+    def cost_values(self, observations: Tensor) -> Tensor:
+        """The values of the costs of observations [batch, size] -> [batch, cost]."""
+        return torch.cat([critic(observations) for critic in self.cost_critics], dim=-1)
+
+    def act(self, observations: Tensor, masks: Tensor | None, generator: torch.Generator | None) -> Tensor:
+        """Actions for observations [batch, size]: int64 [batch], or float32 [batch, dimensions] before clipping.
+
+        Args:
+            observations: Normalised as in training.
+            masks: Legal discrete actions, bool [batch, actions]; None: all are.
+            generator: Source of the sample, on the CPU; None: the most probable action.
+        """
+        output = self.actor(observations)
+        if self.continuous:
+            mean: Tensor = output
+            if generator is None:
+                return mean
+            return mean + self.log_std.exp() * torch.randn(mean.shape, generator=generator).to(mean.device)
+        log_probabilities = _log_probabilities(output, masks)
+        if generator is None:
+            return log_probabilities.argmax(dim=-1)
+        actions = torch.multinomial(log_probabilities.exp().cpu(), 1, generator=generator)
+        return actions.squeeze(-1).to(output.device)
+
+    def log_probability_and_entropy(
+        self, observations: Tensor, actions: Tensor, masks: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """Of the actions (as ``act`` returned them), and of the policy, each [batch]."""
+        output = self.actor(observations)
+        if self.continuous:
+            deviations = (actions - output) / self.log_std.exp()
+            log_densities = -0.5 * deviations.square() - self.log_std - 0.5 * math.log(2 * math.pi)
+            entropy = (self.log_std + 0.5 * math.log(2 * math.pi * math.e)).sum()
+            return log_densities.sum(dim=-1), entropy.expand(len(actions))
+        log_probabilities = _log_probabilities(output, masks)
+        entropies = -(log_probabilities.exp() * log_probabilities).sum(dim=-1)
+        return log_probabilities.gather(-1, actions.unsqueeze(-1)).squeeze(-1), entropies
+
+
+def _log_probabilities(logits: Tensor, masks: Tensor | None) -> Tensor:
+    if masks is not None:
+        logits = logits.masked_fill(~masks, _ILLEGAL_LOGIT)
+    return logits.log_softmax(dim=-1)
+
+
+def _network(
+    inputs: int, layers: Sequence[int], outputs: int, output_gain: float, generator: torch.Generator | None
+) -> nn.Sequential:
+    """A tanh network with orthogonal weights; a small ``output_gain`` makes the first policy nearly indifferent."""
+    widths = (inputs, *layers, outputs)
+    modules: list[nn.Module] = []
+    for k, (width, next_width) in enumerate(itertools.pairwise(widths)):
+        last = k == len(widths) - 2
+        # Linear's own initialisation would draw from the global random state.
+        linear = nn.utils.skip_init(nn.Linear, width, next_width)  # type: ignore[no-untyped-call]
+        nn.init.orthogonal_(linear.weight, output_gain if last else math.sqrt(2.0), generator)
+        nn.init.zeros_(linear.bias)
+        modules += [linear] if last else [linear, nn.Tanh()]
+    return nn.Sequential(*modules)
+
+
+def load_policy(state: Mapping[str, Any]) -> ActorCritic:
+    """The networks of a checkpoint's section ``policy``."""
+    network = ActorCritic(
+        state["observation_size"],
+        state["action_size"],
+        continuous=state["continuous"],
+        actor_layers=state["actor_layers"],
+        critic_layers=state["critic_layers"],
+        initial_log_std=0.0,
+        n_costs=state["n_costs"],
+    )
+    network.load_state_dict(state["network"])
+    return network
+
+
+# --- Rollouts -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """What happened between two updates; every array is [num_steps, num_envs, ...]."""
+
+    observations: Tensor
+    """float32, normalised with the statistics of their moment"""
+    masks: Tensor | None
+    """bool, legal discrete actions"""
+    actions: Tensor
+    """int64, or float32 before clipping"""
+    log_probabilities: Tensor
+    """of the actions, under the policy that chose them"""
+    rewards: Tensor
+    """R_k, scaled"""
+    discounts: Tensor
+    """gamma ** n_k"""
+    values: Tensor
+    """V(s_k)"""
+    next_values: Tensor
+    """V_{k+1}: 0 after a termination, of the last observation at a truncation"""
+    ended: Tensor
+    """bool, the episode ended with this transition"""
+    decided: Tensor
+    """bool, the action had an effect; False where the episode had ended before the agent's first decision"""
+
+    @classmethod
+    def stack(cls, steps: Sequence[Self]) -> Self:
+        """One rollout of steps, whose arrays are [num_envs, ...]."""
+        columns: dict[str, Any] = {}
+        for field in fields(cls):
+            column = [getattr(step, field.name) for step in steps]
+            columns[field.name] = None if column[0] is None else torch.stack(column)
+        return cls(**columns)
+
+
+def advantages_of_rewards(rollout: Rollout, gae_lambda: float) -> Tensor:
+    """A_k of all transitions [num_steps, num_envs] (equations above)."""
+    return generalized_advantages(
+        rollout.rewards, rollout.discounts, rollout.values, rollout.next_values, rollout.ended, gae_lambda
+    )
+
+
+def generalized_advantages(
+    amounts: Tensor, discounts: Tensor, values: Tensor, next_values: Tensor, ended: Tensor, gae_lambda: float
+) -> Tensor:
+    """How much more than expected follows a transition, in rewards or in costs; all arrays are [num_steps, ...]."""
+    deltas = amounts + discounts * next_values - values
+    decays = discounts * gae_lambda * (~ended)
+    advantages = torch.empty_like(deltas)
+    following = torch.zeros_like(deltas[0])
+    for k in reversed(range(len(deltas))):
+        following = deltas[k] + decays[k] * following
+        advantages[k] = following
+    return advantages
+
+
+def values_that_follow(values: Tensor, last_values: Tensor, at_ends: Tensor, ended: Tensor) -> Tensor:
+    """V_{k+1} of values V(s_k), [num_steps, num_envs, ...]: those of the next step, ``at_ends`` where episodes ended.
+
+    ``last_values`` [num_envs, ...] are those of what the last step showed.
+    """
+    return torch.where(ended, at_ends, torch.cat([values[1:], last_values.unsqueeze(0)]))
+
+
+# --- Training -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Minibatch:
+    """Some transitions of a rollout; every array is [batch, ...]."""
+
+    observations: Tensor
+    masks: Tensor | None
+    actions: Tensor
+    log_probabilities: Tensor
+    values: Tensor
+    advantages: Tensor
+    returns: Tensor
+
+    def rows(self, chosen: Tensor) -> Self:
+        """The transitions with these indices, int64 [batch]."""
+        columns: dict[str, Any] = {name: None if array is None else array[chosen] for name, array in vars(self).items()}
+        return type(self)(**columns)
+
+
+@dataclass(frozen=True)
+class Losses:
+    """The loss, its parts, and how far the policy has moved; all scalars."""
+
+    total: Tensor
+    policy: Tensor
+    value: Tensor
+    entropy: Tensor
+    approximate_kl: Tensor
+    """mean of (ratio - 1) - log ratio, an unbiased estimate of KL(old || new) (Schulman, 2020)"""
+    clip_fraction: Tensor
+    """share of ratios outside 1 +- clip_coefficient"""
+
+
+class OnPolicyTrainer(Trainer):
+    """One training run; a subclass says what is learned from a rollout."""
+
+    args: OnPolicyArgs
+
+    def __init__(self, args: OnPolicyArgs, envs: VectorEnv[Any, Any, Any], *, n_costs: int = 0) -> None:
+        """Set up networks and optimiser.
+
+        Args:
+            args: Hyperparameters.
+            envs: The environments.
+            n_costs: Costs that have critics of their own.
+
+        Raises:
+            UsageError: the environments cannot be learned with these hyperparameters.
+        """
+        super().__init__(args, envs)
+        if args.normalize_observations:
+            self.envs = NormalizeObservation(envs)
+        self.network = ActorCritic(
+            self.observation_size,
+            self.action_size,
+            continuous=self.continuous,
+            actor_layers=args.actor_layers,
+            critic_layers=args.critic_layers,
+            initial_log_std=args.initial_log_std,
+            n_costs=n_costs,
+            generator=self.generator,
+        )
+        if args.initial_do_nothing is not None and not self.continuous:
+            self.network.prefer_first_action(args.initial_do_nothing)
+        self.network.to(self.device)
+        critics = (self.network.critic, *self.network.cost_critics)
+        self._groups = (self.network.actor_parameters(), *(list(critic.parameters()) for critic in critics))
+        self.optimizer = torch.optim.Adam([{"params": parameters} for parameters in self._groups], eps=1e-5)
+
+    @abstractmethod
+    def update(self, rollout: Any) -> dict[str, float]:
+        """Improve the networks on a rollout; transitions that no decision began are left out."""
+
+    @abstractmethod
+    def losses(self, batch: Any) -> Losses:
+        """What is minimised on a minibatch."""
+
+    def before_update(self) -> dict[str, float]:
+        """What is to be done between a rollout and the update on it, and its metrics."""
+        return {}
+
+    def iterate(self) -> dict[str, float]:
+        """Play ``num_steps`` decisions in every environment, learn from them, and return the metrics."""
+        if self._observations is None:
+            self._observations = self._reset()
+        rollout, metrics = self.collect()
+        metrics["charts/grid_steps"] = float(self.grid_steps)
+        metrics |= self.before_update()
+        metrics |= self.update(rollout)
+        if self.continuous:
+            metrics["charts/action_std"] = float(self.network.log_std.detach().exp().mean())
+        self.iteration += 1
+        return metrics
+
+    def collect(self) -> tuple[Rollout, dict[str, float]]:
+        """Play one rollout."""
+        tally = Tally()
+        steps = [self._play(tally)[0] for _ in range(self.args.num_steps)]
+        rollout = type(steps[0]).stack(steps)
+        with torch.no_grad():
+            last_values = self.network.value(self._tensor(self._observations, torch.float32))
+        following = values_that_follow(rollout.values, last_values, rollout.next_values, rollout.ended)
+        return replace(rollout, next_values=following), tally.metrics()
+
+    def _play(self, tally: Tally) -> tuple[Rollout, Played]:
+        """One decision in every environment: a step of a rollout, its ``next_values`` known where episodes ended."""
+        args, network = self.args, self.network
+        observations = self._tensor(self._observations, torch.float32)
+        masks = self._tensor(self.envs.action_masks()) if args.mask_actions else None  # type: ignore[attr-defined]
+        with torch.no_grad():
+            actions = network.act(observations, masks, self.generator)
+            log_probabilities, _ = network.log_probability_and_entropy(observations, actions, masks)
+            values = network.value(observations)
+        played = self._step(self._playable(actions), tally)
+        self._observations = played.observations
+        at_ends = torch.zeros(args.num_envs, device=self.device)
+        if played.completed.any():
+            with torch.no_grad():
+                last = self._tensor(np.stack(played.last_observations()), torch.float32)
+                at_ends[self._tensor(played.completed)] = network.value(last)
+        step = Rollout(
+            observations,
+            masks,
+            actions,
+            log_probabilities,
+            rewards=self._tensor(played.rewards * self.reward_scale, torch.float32),
+            discounts=self._tensor(args.gamma**played.n_steps, torch.float32),
+            values=values,
+            next_values=at_ends,
+            ended=self._tensor(played.ended),
+            decided=self._tensor(played.decided),
+        )
+        return step, played
+
+    def improve(self, data: Minibatch, decided: Tensor) -> tuple[list[Any], int]:
+        """Descend on minibatches of the transitions that a decision began, epoch after epoch.
+
+        Args:
+            data: All transitions [num_steps * num_envs, ...].
+            decided: bool, of the same length.
+
+        Returns:
+            The losses of every minibatch, and the number of epochs.
+        """
+        args, rows = self.args, decided.nonzero().squeeze(-1)
+        history: list[Losses] = []
+        epochs = 0
+        for _ in range(args.update_epochs if len(rows) else 0):
+            order = rows[torch.randperm(len(rows), generator=self.generator).to(self.device)]
+            first = len(history)
+            for chosen in order.tensor_split(args.num_minibatches):
+                if len(chosen):
+                    history.append(self._descend(data.rows(chosen)))
+            epochs += 1
+            if args.target_kl is not None and mean(loss.approximate_kl for loss in history[first:]) > args.target_kl:
+                break
+        return history, epochs
+
+    def set_learning_rates(self) -> tuple[float, float]:
+        """Let the step sizes follow their schedule; those of the actor and of the critics."""
+        remaining = 1.0 - self.iteration / self.num_iterations if self.args.anneal_learning_rate else 1.0
+        rates = (remaining * self.args.actor_learning_rate, remaining * self.args.critic_learning_rate)
+        actor, *critics = self.optimizer.param_groups
+        actor["lr"] = rates[0]
+        for critic in critics:
+            critic["lr"] = rates[1]
+        return rates
+
+    def learned(self) -> Mapping[str, nn.Module | torch.optim.Optimizer]:
+        """See :class:`Trainer`."""
+        return {"network": self.network, "optimizer": self.optimizer}
+
+    def policy(self) -> tuple[nn.Module, dict[str, Any]]:
+        """See :class:`Trainer`."""
+        layers = {"actor_layers": list(self.args.actor_layers), "critic_layers": list(self.args.critic_layers)}
+        return self.network, {**layers, "n_costs": len(self.network.cost_critics)}
+
+    def normalizer_state(self) -> dict[str, Any] | None:
+        """See :class:`Trainer`."""
+        return self.envs.normalizer.state_dict() if isinstance(self.envs, NormalizeObservation) else None
+
+    def _playable(self, actions: Tensor) -> NDArray[Any]:
+        """What the environments are given: ids, or the actions clipped into their box."""
+        actions = actions.cpu()
+        return actions.clamp(-1.0, 1.0).numpy() if self.continuous else actions.numpy()
+
+    def _descend(self, batch: Minibatch) -> Losses:
+        loss = self.losses(batch)
+        self.optimizer.zero_grad()
+        loss.total.backward()  # type: ignore[no-untyped-call]
+        for parameters in self._groups:
+            nn.utils.clip_grad_norm_(parameters, self.args.max_grad_norm)
+        self.optimizer.step()
+        return replace(loss, total=loss.total.detach())

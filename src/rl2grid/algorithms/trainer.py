@@ -1,0 +1,203 @@
+"""What all trainers have in common: a step of every environment and the account of it, budget, checkpoints.
+
+Transitions of varying length
+    Between two decisions the grid makes n_k >= 1 steps (heuristics, or a reset, play the others): a
+    semi-Markov decision process. With the discount gamma of one grid step, transition k is worth
+
+        R_k = sum over j < n_k of gamma^j r_{k,j}                  info["discounted_reward"]
+
+    and what follows it is discounted by gamma^{n_k}.
+
+Randomness
+    Initial weights and actions come from one generator seeded by ``Args.seed`` and saved with the
+    checkpoint; nothing reads a global random state. The generator is the processor's also when networks are on
+    a GPU. Environment i is seeded ``seed * num_envs + i``: runs of different seeds share no episode.
+"""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+import torch
+from gymnasium.spaces import Box
+from gymnasium.vector import VectorEnv
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from rl2grid.algorithms.devices import find_device
+from rl2grid.algorithms.hyperparameters import SharedArgs
+from rl2grid.algorithms.playing import Tally, check_environments, of_transition, reported, resume_environments
+from rl2grid.errors import UsageError
+
+
+class Played(NamedTuple):
+    """What a decision in every environment led to; every array is [num_envs, ...]."""
+
+    observations: NDArray[np.float32]
+    """shown now; where an episode ended, the next one's first"""
+    rewards: NDArray[np.float64]
+    """R_k, not scaled"""
+    n_steps: NDArray[np.int64]
+    """n_k"""
+    ended: NDArray[np.bool_]
+    """the episode ended with this transition"""
+    terminated: NDArray[np.bool_]
+    """... by a game over"""
+    completed: NDArray[np.bool_]
+    """... otherwise; its last observation is in ``infos["final_obs"]``"""
+    decided: NDArray[np.bool_]
+    """the action had an effect; False where the episode had ended before the agent's first decision"""
+    infos: Mapping[str, Any]
+
+    def last_observations(self) -> list[NDArray[np.float32]]:
+        """The last observations of completed episodes, in the order of their environments."""
+        return [self.infos["final_obs"][i] for i in np.flatnonzero(self.completed)]
+
+
+class Trainer(ABC):
+    """One training run: ``iterate`` until ``finished``; ``state_dict`` between two iterations holds all of it."""
+
+    deterministic_on: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
+    """Types of device on which only PyTorch's deterministic algorithms are used."""
+
+    def __init__(self, args: SharedArgs, envs: VectorEnv[Any, Any, Any]) -> None:
+        """Everything but the networks; the environments are reset at the first iteration.
+
+        Raises:
+            UsageError: the environments cannot be learned with these hyperparameters.
+        """
+        torch.set_num_threads(args.torch_threads)
+        self.args = args
+        self.device = find_device(args.device)
+        torch.use_deterministic_algorithms(self.device.type in self.deterministic_on)
+        self.continuous = check_environments(
+            args.algorithm, envs, num_envs=args.num_envs, mask_actions=args.mask_actions
+        )
+        self.envs = envs
+        self.generator = torch.Generator().manual_seed(args.seed)
+        observation_shape, action_space = envs.single_observation_space.shape, envs.single_action_space
+        assert observation_shape is not None
+        self.observation_size = int(observation_shape[0])
+        self.action_size = int(action_space.shape[0] if isinstance(action_space, Box) else action_space.n)  # type: ignore[attr-defined]
+        self.reward_scale = 1.0 - args.gamma if args.reward_scale is None else args.reward_scale
+
+        self.num_iterations = args.total_timesteps // (args.num_envs * args.num_steps)
+        self.iteration = 0
+        self.decisions = 0
+        """Decisions made so far, over all environments."""
+        self.grid_steps = 0
+        """Grid steps behind them."""
+        self._observations: NDArray[np.float32] | None = None
+        self._over = np.zeros(args.num_envs, np.bool_)
+        self._episode_return = np.zeros(args.num_envs, np.float64)
+        self._episode_length = np.zeros(args.num_envs, np.int64)
+
+    @property
+    def finished(self) -> bool:
+        """Whether the budget of decisions is used up."""
+        return self.iteration >= self.num_iterations
+
+    @abstractmethod
+    def iterate(self) -> dict[str, float]:
+        """Play ``num_steps`` decisions in every environment, learn, and return the metrics."""
+
+    @abstractmethod
+    def learned(self) -> Mapping[str, nn.Module | torch.optim.Optimizer]:
+        """Networks and optimisers by name: all that updates change."""
+
+    @abstractmethod
+    def policy(self) -> tuple[nn.Module, dict[str, Any]]:
+        """The network that acts, and what is needed to make it again."""
+
+    @abstractmethod
+    def normalizer_state(self) -> dict[str, Any] | None:
+        """The statistics that scale observations; None without normalisation."""
+
+    def policy_state(self) -> dict[str, Any]:
+        """All that is needed to act: see ``load_policy``; ``normalizer`` is None without normalisation."""
+        network, sizes = self.policy()
+        return {
+            "network": network.state_dict(),
+            "normalizer": self.normalizer_state(),
+            "observation_size": self.observation_size,
+            "action_size": self.action_size,
+            "continuous": self.continuous,
+            "mask_actions": self.args.mask_actions,
+            **sizes,
+        }
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that is needed to go on, after an iteration."""
+        return {
+            **{name: part.state_dict() for name, part in self.learned().items()},
+            "generator": self.generator.get_state(),
+            "iteration": self.iteration,
+            "decisions": self.decisions,
+            "grid_steps": self.grid_steps,
+            "observations": np.array(self._observations),
+            "over": self._over,
+            "episode_return": self._episode_return,
+            "episode_length": self._episode_length,
+            "envs": self.envs.state_dict(),  # type: ignore[attr-defined]
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on where ``state_dict`` was called, bit for bit.
+
+        Raises:
+            UsageError: the environments, played again, are not where they were.
+        """
+        for name, part in self.learned().items():
+            part.load_state_dict(state[name])
+        self.generator.set_state(state["generator"])
+        self.iteration, self.decisions = state["iteration"], state["decisions"]
+        self.grid_steps = state["grid_steps"]
+        self._observations = np.array(state["observations"])
+        self._over = np.array(state["over"])
+        self._episode_return = np.array(state["episode_return"])
+        self._episode_length = np.array(state["episode_length"])
+        resume_environments(self.envs, state["envs"], self._observations)
+
+    def _reset(self) -> NDArray[np.float32]:
+        """Begin the first episodes; what they show."""
+        observations: NDArray[np.float32]
+        observations, infos = self.envs.reset(seed=self.args.seed * self.args.num_envs)
+        self._over = reported(infos, "over", np.zeros(self.args.num_envs, np.bool_))
+        return observations
+
+    def _step(self, actions: NDArray[Any], tally: Tally) -> Played:
+        """Play a decision in every environment and count it.
+
+        Raises:
+            UsageError: the environments play several grid steps per decision and do not tell what they are worth.
+        """
+        decided = ~self._over
+        begin = time.perf_counter()
+        observations, rewards, terminated, truncated, infos = self.envs.step(actions)
+        seconds = time.perf_counter() - begin
+
+        ended = terminated | truncated
+        self._over = reported(infos, "over", np.zeros_like(ended)) & ended
+        n_steps = of_transition(infos, "n_steps", ended, np.ones(self.args.num_envs, np.int64))
+        discounted = of_transition(infos, "discounted_reward", ended, np.where(n_steps == 1, rewards, np.nan))
+        if np.isnan(discounted).any():
+            raise UsageError(
+                "The environment plays several grid steps per decision without info['discounted_reward']: "
+                f"make it with gamma={self.args.gamma}."
+            )
+        self.decisions += self.args.num_envs
+        self.grid_steps += int(n_steps.sum())
+        self._episode_return += rewards
+        self._episode_length += 1
+        tally.note(n_steps, seconds, infos, ended, self._episode_return, self._episode_length)
+        self._episode_return[ended] = 0.0
+        self._episode_length[ended] = 0
+        return Played(observations, discounted, n_steps, ended, terminated, truncated & ~terminated, decided, infos)
+
+    def _tensor(self, values: Any, dtype: torch.dtype | None = None) -> Tensor:
+        """A copy of an array on the networks' device."""
+        return torch.tensor(values, dtype=dtype, device=self.device)
