@@ -7,7 +7,8 @@ import gymnasium
 import pytest
 
 import rl2grid  # noqa: F401 - registers the tasks
-from rl2grid.envs.tasks import TaskOptions, all_tasks, find_task
+from rl2grid.envs.options import TaskOptions
+from rl2grid.envs.tasks import all_tasks, find_task
 from rl2grid.errors import UsageError
 
 

@@ -5,24 +5,33 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from rl2grid.engines import DISPATCHES, ENGINES, HEURISTICS
-from rl2grid.envs.tasks import CONSTRAINTS
+from rl2grid.envs.options import option_texts, options_without
 
-NAMES = ("heuristic", "constraint", "engine", "reward", "normalize", "dispatch", "maintenance", "opponent")
+GIVEN_OTHERWISE = ("split", "scenario", "gamma")
+"""Keywords that a command gives itself, or asks for in another way."""
+NAMES: tuple[str, ...] = tuple(option.name for option in options_without(*GIVEN_OTHERWISE))
+"""Keywords that are flags."""
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add a flag for each of :data:`NAMES`; those that are not given leave no trace."""
-    add = parser.add_argument_group("environment").add_argument
-    without = argparse.SUPPRESS
-    add("--heuristic", default=without, choices=("None", *HEURISTICS), help="by default the agent's own")
-    add("--constraint", default=without, choices=("None", *CONSTRAINTS), help="for tasks whose id names none")
-    add("--engine", default=without, choices=ENGINES, help="native (default), or Grid2Op itself")
-    add("--reward", default=without, metavar="REWARD", help="default, paper, released, or weights such as 1,0.5,0")
-    add("--normalize", default=without, choices=("None", "physical"), help="of observations; by default the policy's")
-    add("--dispatch", default=without, choices=DISPATCHES, help="how redispatch is solved")
-    add("--maintenance", default=without, action=argparse.BooleanOptionalAction, help="whether it happens")
-    add("--opponent", default=without, action=argparse.BooleanOptionalAction, help="whether it attacks")
+    group = parser.add_argument_group(
+        "environment", "keywords of the environment; heuristic and normalize are by default those of a trained policy"
+    )
+    for option in options_without(*GIVEN_OTHERWISE):
+        choices = option.metadata.get("choices")
+        how: dict[str, Any] = {"choices": tuple(map(str, choices))} if choices else {"metavar": option.name.upper()}
+        if isinstance(option.default, bool):
+            how = {"action": argparse.BooleanOptionalAction}
+        group.add_argument(
+            f"--{option.name}", default=argparse.SUPPRESS, help=flag_text(option.name).replace("%", "%%"), **how
+        )
+
+
+def flag_text(name: str) -> str:
+    """What a keyword means, for the help of its flag."""
+    declared = {option.name: option for option in options_without()}
+    return str(declared[name].metadata.get("flag") or option_texts()[name])
 
 
 def given(options: argparse.Namespace) -> dict[str, Any]:

@@ -6,18 +6,21 @@ import contextlib
 import difflib
 import io
 import sys
-from dataclasses import Field, dataclass, fields, make_dataclass
+from dataclasses import Field, asdict, dataclass, field, fields, make_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
-from rl2grid.cli.keywords import NAMES, reward_of
-from rl2grid.envs.tasks import TaskOptions, find_task
+from rl2grid.cli.keywords import flag_text, reward_of
+from rl2grid.envs.options import TaskOptions, options_of, options_without
+from rl2grid.envs.tasks import find_task
 from rl2grid.errors import UsageError, one_of
 from rl2grid.training.limits import TimeLimit
 
 if TYPE_CHECKING:
     from rl2grid.training.runs import Hyperparameters
 
+GIVEN_OTHERWISE = ("split", "gamma")
+"""Keywords that a training decides itself."""
 INTERRUPTED = 130
 """Exit status after an interrupt, as shells have it."""
 
@@ -34,30 +37,12 @@ interrupted goes on with --resume. Flags and their defaults with --help after th
 
 @dataclass(frozen=True)
 class TrainFlags:
-    """How the run is made; the algorithm's hyperparameters are flags as well."""
+    """How the run is made; the environment's keywords and the algorithm's hyperparameters are flags as well."""
 
     preset: str = "default"
     """Hyperparameters to start from: ``default`` or ``paper``; single flags replace single values."""
     folder: Path | None = None
     """Run folder, which must not exist yet; None: runs/<task>-<algorithm>-<seed>."""
-    heuristic: str | None = None
-    """What plays while the grid is safe: None, ``idle`` or ``recovery``."""
-    scenario: str | None = None
-    """Train on this scenario only; None: on all of the training split."""
-    reward: str = "default"
-    """Reward preset, ``default``, ``paper`` or ``released``, or weights of its three components: ``1,0.5,0``."""
-    constraint: str | None = None
-    """Safety constraint: ``LSI`` or ``TLO``, for tasks whose id names none; None: that of the id."""
-    normalize: str | None = "physical"
-    """``physical``: divide observations by constants of the grid; None: physical units."""
-    engine: str = "native"
-    """``native``, or ``reference``: Grid2Op itself."""
-    dispatch: str = "exact"
-    """``exact`` or ``grid2op``."""
-    maintenance: bool = True
-    """Whether planned maintenance happens."""
-    opponent: bool = True
-    """Whether the grid's opponent attacks."""
     num_threads: int | None = None
     """Native engine: threads that play the environments; None: one per processor core. No influence on results."""
     num_workers: int | None = None
@@ -127,12 +112,11 @@ def _begin(algorithm: str, task_id: str, flags: list[str]) -> int:
         raise one_of("Algorithm", algorithm, tuple(runs.ALGORITHMS))
     chosen = runs.ALGORITHMS[algorithm]
     hyperparameters = runs.hyperparameters(algorithm, task.id, _preset(flags))
-    _refuse_unknown(flags, [*fields(TrainFlags), *fields(chosen.args)])
-    own, hyperparameters = _parse_both(f"rl2grid train {algorithm} {task.id}", flags, hyperparameters)
+    _refuse_unknown(flags, [*fields(TrainFlags), *options_without(*GIVEN_OTHERWISE), *fields(chosen.args)])
+    own, keywords, hyperparameters = _parse_all(f"rl2grid train {algorithm} {task.id}", flags, hyperparameters)
     limit = TimeLimit(own.max_minutes)
-    keywords = {name: getattr(own, name) for name in ("scenario", *NAMES)}
-    keywords["reward"] = reward_of(own.reward)
-    TaskOptions(**keywords)
+    keywords["reward"] = reward_of(keywords["reward"])
+    options_of(task, keywords)
     args = runs.RunArgs(
         task=task.id,
         hyperparameters=hyperparameters,
@@ -184,19 +168,41 @@ def _preset(flags: list[str]) -> str:
     return "default"
 
 
-def _parse_both(program: str, flags: list[str], hyperparameters: Hyperparameters) -> tuple[TrainFlags, Hyperparameters]:
-    """The flags of the run and of the algorithm, in one list."""
+def _parse_all(
+    program: str, flags: list[str], hyperparameters: Hyperparameters
+) -> tuple[TrainFlags, dict[str, Any], Hyperparameters]:
+    """The flags of the run, the environment's keywords and the algorithm's flags, of one list."""
     import tyro
 
+    environment = _environment_flags()
     request = make_dataclass(
         "Request",
         [
             ("flags", tyro.conf.OmitArgPrefixes[TrainFlags]),
+            ("environment", tyro.conf.OmitArgPrefixes[environment]),  # type: ignore[misc, valid-type]
             ("hyperparameters", tyro.conf.OmitArgPrefixes[type(hyperparameters)]),  # type: ignore[misc]
         ],
     )
-    parsed = _parse(program, flags, request(TrainFlags(), hyperparameters))
-    return parsed.flags, parsed.hyperparameters
+    parsed = _parse(program, flags, request(TrainFlags(), environment(), hyperparameters))
+    return parsed.flags, asdict(parsed.environment), parsed.hyperparameters
+
+
+def _environment_flags() -> type[Any]:
+    """A dataclass with the keywords that are flags; a reward is text."""
+    import tyro
+
+    hints = get_type_hints(TaskOptions) | {"reward": str}
+    return make_dataclass(
+        "Environment",
+        [
+            (
+                option.name,
+                Annotated[hints[option.name], tyro.conf.arg(help=flag_text(option.name))],
+                field(default=option.default),
+            )
+            for option in options_without(*GIVEN_OTHERWISE)
+        ],
+    )
 
 
 def _parse(program: str, flags: list[str], default: Any) -> Any:

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from rl2grid.envs.description import check_action
 from rl2grid.envs.environments import Environments, StreamPosition
 from rl2grid.envs.info import batch_info
+from rl2grid.envs.options import TaskOptions
 from rl2grid.envs.rows import Batch
-from rl2grid.envs.tasks import Task, TaskOptions
+from rl2grid.envs.tasks import Task
 from rl2grid.errors import UsageError
 from rl2grid.mdp.features import observation_size
 from rl2grid.scenarios.episodes import EpisodePlan

@@ -15,7 +15,8 @@ from rl2grid.engines.effects import clipping, cooldown_left, refusal
 from rl2grid.engines.transition import Transitions
 from rl2grid.envs.description import action_number
 from rl2grid.envs.info import episode_info
-from rl2grid.envs.tasks import Task, TaskOptions
+from rl2grid.envs.options import TaskOptions
+from rl2grid.envs.tasks import Task
 from rl2grid.errors import UsageError
 from rl2grid.mdp.actions import (
     ActionKind,
@@ -92,7 +93,7 @@ class Environments:
 
     def __init__(self, task: Task, options: TaskOptions, n: int) -> None:
         self.task, self.options, self.grid = task, options, task.grid
-        self.constraint = task.constraint or options.constraint
+        self.constraint = options.constraint
         self.transitions = make_transitions(task, options, n)
         self.engine: Engine = self.transitions.engine
         self._write_observation = observation_writer(task.kind)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from datetime import datetime
 from typing import TYPE_CHECKING, Any, cast
 
@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from rl2grid.engines.transition import Listener
 from rl2grid.envs.description import TaskDescription, single_spaces
 from rl2grid.envs.environments import Environments, SimulationResult
-from rl2grid.envs.tasks import TaskOptions, find_task
+from rl2grid.envs.options import keyword_names, options_of, shows_options
+from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError, one_of
 from rl2grid.mdp.state import GridState
 
@@ -75,7 +76,7 @@ class PowerGridEnv(gymnasium.Env[NDArray[np.float32], Any], TaskDescription):
     ending.
 
     ## Arguments
-    See :class:`rl2grid.envs.tasks.TaskOptions`; `render_mode="rgb_array"` makes `render` draw the grid.
+    See :class:`rl2grid.envs.options.TaskOptions`; `render_mode="rgb_array"` makes `render` draw the grid.
 
     ## Information
     See :data:`rl2grid.envs.info.INFO_KEYS`.
@@ -83,42 +84,21 @@ class PowerGridEnv(gymnasium.Env[NDArray[np.float32], Any], TaskDescription):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 12}  # noqa: RUF012 - Gymnasium's convention
 
+    @shows_options
     def __init__(
         self,
-        task_id: str,
+        task: Task | str,
         *,
-        engine: str = "native",
-        heuristic: str | None = None,
-        reward: str | tuple[float, float, float] | Callable[..., Any] = "default",
-        split: str = "train",
-        scenario: str | None = None,
-        normalize: str | None = "physical",
-        dispatch: str = "exact",
-        constraint: str | None = None,
-        gamma: float | None = None,
-        maintenance: bool = True,
-        opponent: bool = True,
         render_mode: str | None = None,
+        **keywords: Any,
     ) -> None:
         if render_mode not in (None, "rgb_array"):
             raise one_of("render_mode", render_mode, ("None", "rgb_array"))
         self.render_mode = render_mode
         self._renderer: FrameRenderer | None = None
         self._last_action: Any = None
-        self.task = find_task(task_id)
-        self.options = TaskOptions(
-            engine,
-            heuristic,
-            reward,
-            split,
-            scenario,
-            normalize,
-            dispatch,
-            self.task.constraint or constraint,
-            gamma,
-            maintenance,
-            opponent,
-        )
+        self.task = find_task(task)
+        self.options = options_of(self.task, keywords, keyword_names(type(self)))
         self._environments = Environments(self.task, self.options, 1)
         observations, self.action_space = single_spaces(self.task)
         self.observation_space = cast("gymnasium.Space[NDArray[np.float32]]", observations)

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from rl2grid.engines.native.transitions import Commands, NativeTransitions
 from rl2grid.envs.engine_rows import I64, EngineRows
-from rl2grid.envs.tasks import Task, TaskOptions
+from rl2grid.envs.options import TaskOptions
+from rl2grid.envs.tasks import Task
 from rl2grid.mdp.actions import ActionKind
 from rl2grid.scenarios.episodes import EpisodePlan
 

@@ -16,5 +16,5 @@ def register_all() -> None:
             id=task_id,
             entry_point="rl2grid.envs.grid_env:PowerGridEnv",
             vector_entry_point="rl2grid.envs.vector:PowerGridVectorEnv",
-            kwargs={"task_id": task_id},
+            kwargs={"task": task_id},
         )

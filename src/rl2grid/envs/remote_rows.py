@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rl2grid.envs.description import check_action
+from rl2grid.envs.options import TaskOptions
 from rl2grid.envs.rows import Batch
-from rl2grid.envs.tasks import Task, TaskOptions
+from rl2grid.envs.tasks import Task
 from rl2grid.envs.worker import Worker
 from rl2grid.errors import UsageError
 

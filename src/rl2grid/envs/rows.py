@@ -14,7 +14,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from rl2grid.envs.tasks import Task, TaskOptions
+from rl2grid.envs.options import TaskOptions
+from rl2grid.envs.tasks import Task
 from rl2grid.errors import UsageError
 
 

@@ -1,16 +1,12 @@
-"""The 103 tasks and the keywords that they are made with."""
+"""The 103 tasks."""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
-from rl2grid.engines import DISPATCHES, ENGINES, HEURISTICS
-from rl2grid.errors import UsageError, one_of
+from rl2grid.errors import UsageError
 from rl2grid.grids import GRID_IDS, Grid, load_grid
-from rl2grid.scenarios.splits import SPLITS
 
 VERSION = 0
 """Version of every id; raised when anything that defines a result changes."""
@@ -61,17 +57,22 @@ def all_tasks() -> dict[str, Task]:
     return {task.id: task for task in tasks}
 
 
-def find_task(task_id: str) -> Task:
-    """The task called ``task_id``; the namespace and the version may be left out.
+def find_task(task: Task | str) -> Task:
+    """The task with the id ``task``, whose namespace and version may be left out; a task is its own.
+
+    Ids are read once, where they come from: the command line, ``gymnasium.make``, a file, a call of the user. What
+    lies behind hands the task on.
 
     Raises:
         UsageError: there is no such task.
     """
-    name = task_id.removeprefix("rl2grid/")
+    if isinstance(task, Task):
+        return task
+    name = task.removeprefix("rl2grid/")
     for candidate in (f"rl2grid/{name}", f"rl2grid/{name}-v{VERSION}"):
         if candidate in all_tasks():
             return all_tasks()[candidate]
-    raise _unknown_task(task_id, name)
+    raise _unknown_task(task, name)
 
 
 def short_id(task_id: str) -> str:
@@ -107,57 +108,3 @@ def _unknown_task(task_id: str, name: str) -> UsageError:
         f"Task {task_id!r} does not exist: the tasks of {grid_id} are {grid_id}-T<level>[-LSI|-TLO]-v{VERSION} "
         f"with level {levels}, and {grid_id}-R-v{VERSION}."
     )
-
-
-@dataclass(frozen=True)
-class TaskOptions:
-    """The keywords of ``gymnasium.make`` and ``make_vec``.
-
-    Raises:
-        UsageError: a value is not allowed; the message lists those that are.
-    """
-
-    engine: str = "native"
-    """``"native"``: ours, compiled; ``"reference"``: Grid2Op with LightSim2Grid."""
-    heuristic: str | None = None
-    """What plays while the grid is safe: None (the agent decides every step), ``"idle"`` or ``"recovery"``."""
-    reward: str | tuple[float, float, float] | Callable[..., Any] = "default"
-    """A preset (``"default"``, ``"paper"``, ``"released"``), the weights of the three default components,
-    or a compiled function ``(state, i) -> (survive, overload, cost)``."""
-    split: str = "train"
-    """Which scenarios are played: ``"train"`` (months without end), ``"validation"`` or ``"test"`` (20 months each), or
-    ``"bundled"``, the series inside the Grid2Op wheel."""
-    scenario: str | None = None
-    """Play this scenario only."""
-    normalize: str | None = "physical"
-    """``"physical"``: divide observations by constants of the grid; None: physical units."""
-    dispatch: str = "exact"
-    """How redispatch is solved: ``"exact"``, or ``"grid2op"`` with Grid2Op's own solver."""
-    constraint: str | None = None
-    """Which cost is ``info["cost"]``; given by the id of constrained tasks."""
-    gamma: float | None = None
-    """Adds ``info["discounted_reward"]``: the discounted sum over a transition's grid steps."""
-    maintenance: bool = True
-    """Whether planned maintenance happens."""
-    opponent: bool = True
-    """Whether the grid's opponent attacks."""
-
-    def __post_init__(self) -> None:
-        _check("engine", self.engine, ENGINES)
-        _check("heuristic", self.heuristic, ("None", *HEURISTICS))
-        _check("split", self.split, SPLITS)
-        _check("normalize", self.normalize, ("physical", "None"))
-        _check("dispatch", self.dispatch, DISPATCHES)
-        _check("constraint", self.constraint, ("None", *CONSTRAINTS))
-        if self.gamma is not None and not (isinstance(self.gamma, int | float) and 0 <= self.gamma <= 1):
-            raise UsageError(f"gamma={self.gamma!r} is not allowed: give a discount between 0 and 1, or None.")
-        for name in ("maintenance", "opponent"):
-            if not isinstance(getattr(self, name), bool):
-                raise UsageError(f"{name}={getattr(self, name)!r} is not allowed: choose True or False.")
-
-
-def _check(keyword: str, value: object, allowed: tuple[str, ...]) -> None:
-    if value is None and "None" in allowed:
-        return
-    if not isinstance(value, str) or value not in allowed or value == "None":
-        raise one_of(f"Value for {keyword},", value, allowed)

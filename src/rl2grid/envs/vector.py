@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import gymnasium
@@ -12,8 +11,9 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from rl2grid.envs.description import TaskDescription, single_spaces
+from rl2grid.envs.options import keyword_names, options_of, shows_options
 from rl2grid.envs.rows import Batch, make_rows
-from rl2grid.envs.tasks import TaskOptions, find_task
+from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
 
 
@@ -31,32 +31,24 @@ class PowerGridVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], Any, ND
     valid until the step after the next. ``infos["action_effect"]`` holds objects that are put into words by ``str``.
 
     Args:
-        task_id: the task.
+        task: the task, or its id.
         num_envs: number of environments.
         num_threads: native engine: threads that share the environments; None takes one per processor core.
         num_workers: reference engine: number of processes; 0 plays in this one; None takes one per core.
+        keywords: see :class:`~rl2grid.envs.options.TaskOptions`.
     """
 
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
 
+    @shows_options
     def __init__(
         self,
-        task_id: str,
+        task: Task | str,
         num_envs: int = 1,
         *,
         num_threads: int | None = None,
         num_workers: int | None = None,
-        engine: str = "native",
-        heuristic: str | None = None,
-        reward: str | tuple[float, float, float] | Callable[..., Any] = "default",
-        split: str = "train",
-        scenario: str | None = None,
-        normalize: str | None = "physical",
-        dispatch: str = "exact",
-        constraint: str | None = None,
-        gamma: float | None = None,
-        maintenance: bool = True,
-        opponent: bool = True,
+        **keywords: Any,
     ) -> None:
         if not isinstance(num_envs, int) or num_envs < 1:
             raise UsageError(f"num_envs={num_envs!r} is not allowed: give a number of environments, at least 1.")
@@ -64,20 +56,8 @@ class PowerGridVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], Any, ND
             raise UsageError(f"num_workers={num_workers!r} is not allowed: give a number of processes, 0 or more.")
         if num_threads is not None and (not isinstance(num_threads, int) or num_threads < 1):
             raise UsageError(f"num_threads={num_threads!r} is not allowed: give a number of threads, 1 or more.")
-        self.task = find_task(task_id)
-        self.options = TaskOptions(
-            engine,
-            heuristic,
-            reward,
-            split,
-            scenario,
-            normalize,
-            dispatch,
-            self.task.constraint or constraint,
-            gamma,
-            maintenance,
-            opponent,
-        )
+        self.task = find_task(task)
+        self.options = options_of(self.task, keywords, keyword_names(type(self)))
         self.num_envs = num_envs
         self.single_observation_space, self.single_action_space = single_spaces(self.task)
         self.observation_space = batch_space(self.single_observation_space, num_envs)

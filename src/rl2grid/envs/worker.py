@@ -17,7 +17,8 @@ import traceback
 from typing import Any, BinaryIO
 
 from rl2grid.envs.local_rows import LocalRows
-from rl2grid.envs.tasks import Task, TaskOptions
+from rl2grid.envs.options import TaskOptions
+from rl2grid.envs.tasks import Task
 from rl2grid.errors import UsageError
 
 

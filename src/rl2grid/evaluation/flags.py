@@ -7,7 +7,8 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
-from rl2grid.envs.tasks import TaskOptions, short_id
+from rl2grid.envs.options import TaskOptions
+from rl2grid.envs.tasks import short_id
 
 
 def flags(values: Mapping[str, Any]) -> list[str]:

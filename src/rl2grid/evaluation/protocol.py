@@ -28,7 +28,8 @@ import rich.progress
 from filelock import FileLock, Timeout
 
 from rl2grid.agents.agent import Agent
-from rl2grid.envs.tasks import Task, TaskOptions, constraint_of, find_task
+from rl2grid.envs.options import TaskOptions
+from rl2grid.envs.tasks import Task, constraint_of, find_task
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import make_agent
 from rl2grid.evaluation.crew import Job, Progress, Setting, make_crew

@@ -17,8 +17,9 @@ import gymnasium
 import numpy as np
 
 from rl2grid.agents.agent import Action, Agent, Info, Observation
+from rl2grid.envs.options import TaskOptions
 from rl2grid.envs.registration import register_all
-from rl2grid.envs.tasks import Task, TaskOptions, find_task
+from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import AGENTS, make_agent
 from rl2grid.evaluation.episode import PlayedEpisode, play_episode

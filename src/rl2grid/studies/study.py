@@ -30,7 +30,8 @@ from pathlib import Path
 from typing import Any
 
 from rl2grid.engines import HEURISTICS
-from rl2grid.envs.tasks import TaskOptions, constraint_of, find_task
+from rl2grid.envs.options import TaskOptions
+from rl2grid.envs.tasks import constraint_of, find_task
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import AGENTS, kinds_of
 from rl2grid.evaluation.protocol import evenly_spread

@@ -37,8 +37,9 @@ from rl2grid.algorithms.checkpoint import load_checkpoint, save_checkpoint
 from rl2grid.algorithms.metrics import MetricsWriter
 from rl2grid.algorithms.off_policy import OffPolicyTrainer
 from rl2grid.algorithms.policy_agent import BEST_FILE, CHECKPOINT_FILE, PolicyAgent
+from rl2grid.envs.options import TaskOptions
 from rl2grid.envs.registration import register_all
-from rl2grid.envs.tasks import CONSTRAINTS, Task, TaskOptions, constraint_of, find_task
+from rl2grid.envs.tasks import CONSTRAINTS, Task, constraint_of, find_task
 from rl2grid.errors import UsageError, one_of
 from rl2grid.evaluation.protocol import evenly_spread
 from rl2grid.mdp.actions import action_set_hash

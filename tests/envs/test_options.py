@@ -1,0 +1,117 @@
+"""The keywords of the environments: declared once, from which signatures, refusals and flags follow."""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+import pickle
+from typing import Any
+
+import gymnasium
+import pytest
+
+import rl2grid  # noqa: F401 - registers the tasks
+from rl2grid.cli import keywords
+from rl2grid.cli.main import main
+from rl2grid.envs.grid_env import PowerGridEnv
+from rl2grid.envs.options import OPTION_NAMES, TaskOptions, option_texts, options_of
+from rl2grid.envs.tasks import find_task
+from rl2grid.envs.vector import PowerGridVectorEnv
+from rl2grid.errors import UsageError
+
+DEFAULTS = TaskOptions()
+
+
+@pytest.mark.parametrize(
+    ("constructor", "own"),
+    [(PowerGridEnv, ["render_mode"]), (PowerGridVectorEnv, ["num_threads", "num_workers"])],
+)
+def test_the_signature_of_an_environment_names_every_keyword_with_its_default(constructor: Any, own: list[str]):
+    parameters = inspect.signature(constructor).parameters
+    named = [name for name, each in parameters.items() if each.kind is inspect.Parameter.KEYWORD_ONLY]
+    assert named == [*own, *OPTION_NAMES]
+    assert all(parameters[name].default == getattr(DEFAULTS, name) for name in OPTION_NAMES)
+
+
+@pytest.mark.parametrize("make", [gymnasium.make, gymnasium.make_vec])
+def test_an_unknown_keyword_is_refused_in_one_sentence_that_names_those_allowed(make: Any):
+    with pytest.raises(
+        UsageError, match=r"^Keyword 'heuristics' does not exist: choose one of .*num_threads|render"
+    ) as e:
+        make("rl2grid/bus14-T0-v0", heuristics="idle")
+    assert all(name in str(e.value) for name in OPTION_NAMES)
+
+
+@pytest.mark.parametrize("make", [gymnasium.make, gymnasium.make_vec])
+def test_a_constraint_that_contradicts_the_id_is_refused(make: Any):
+    with pytest.raises(UsageError, match=r"^constraint='TLO' contradicts task 'rl2grid/bus14-T0-LSI-v0': leave it out"):
+        make("rl2grid/bus14-T0-LSI-v0", constraint="TLO")
+
+
+@pytest.mark.parametrize(
+    ("task", "keyword", "constraint"),
+    [
+        ("bus14-T0-LSI", None, "LSI"),
+        ("bus14-T0-LSI", "LSI", "LSI"),
+        ("bus14-T0", "TLO", "TLO"),
+        ("bus14-T0", None, None),
+    ],
+)
+def test_the_constraint_is_that_of_the_id_or_of_the_keyword(task: str, keyword: str | None, constraint: str | None):
+    assert options_of(find_task(task), {"constraint": keyword}).constraint == constraint
+
+
+@pytest.mark.parametrize(("name", "value"), [("engine", None), ("heuristic", "None"), ("split", 3), ("maintenance", 1)])
+def test_values_of_another_kind_are_refused(name: str, value: Any):
+    with pytest.raises(UsageError, match=name):
+        TaskOptions(**{name: value})
+
+
+def test_every_keyword_says_what_it_means():
+    texts = option_texts()
+    assert tuple(texts) == OPTION_NAMES
+    assert texts["normalize"] == "physical: divide observations by constants of the grid; None: physical units."
+    assert 'info["cost"]' in texts["constraint"]
+
+
+def test_flags_follow_from_the_declaration(capsys: pytest.CaptureFixture[str]):
+    parser = argparse.ArgumentParser()
+    keywords.add_flags(parser)
+    words = [
+        "--engine",
+        "reference",
+        "--heuristic",
+        "None",
+        "--reward",
+        "1,2,0",
+        "--no-opponent",
+        "--normalize",
+        "None",
+    ]
+    assert keywords.given(parser.parse_args(words)) == {
+        "engine": "reference",
+        "heuristic": None,
+        "reward": (1.0, 2.0, 0.0),
+        "normalize": None,
+        "opponent": False,
+    }
+    assert keywords.given(parser.parse_args([])) == {}
+    with pytest.raises(SystemExit):
+        parser.parse_args(["--dispatch", "fast"])
+    assert "exact" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", [["evaluate", "--help"], ["train", "ppo", "bus14-T0", "--help"]])
+def test_help_shows_every_keyword_that_is_a_flag(command: list[str], capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit):
+        main(command)
+    shown = capsys.readouterr().out
+    assert all(f"--{name}" in shown for name in keywords.NAMES)
+
+
+def test_tasks_and_options_travel_to_other_processes_and_are_keys():
+    task = find_task("bus36-M-T1-TLO")
+    options = options_of(task, {"heuristic": "idle", "reward": (1.0, 0.5, 0.0)})
+    assert pickle.loads(pickle.dumps((task, options))) == (task, options)
+    assert {task: 1, options: 2} == {find_task(task.id): 1, options: 2}
+    assert find_task(task) is task
