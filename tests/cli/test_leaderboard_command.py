@@ -9,7 +9,8 @@ import pytest
 
 from rl2grid.cli.main import main
 from rl2grid.evaluation.protocol import evaluate
-from rl2grid.records.entries import FACTS, episode_hash
+from rl2grid.records.entries import episode_hash
+from rl2grid.records.episodes import FACTS
 
 MONTH = "generated/700000-00"
 
@@ -24,7 +25,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     contents = json.loads((folder / "random.json").read_text())
     (episode,) = contents["episodes"]
     episode["survival"] = 0.999
-    episode["hash"] = episode_hash({name: episode[name] for name in FACTS})
+    episode["hash"] = episode_hash({column.name: episode[column.name] for column in FACTS})
     (folder / "forged.json").write_text(json.dumps(contents))
     return folder
 

@@ -182,7 +182,7 @@ def test_a_torn_row_is_played_again(tmp_path):
 def test_killed_in_the_middle_and_continued_equals_uninterrupted(tmp_path):
     out = tmp_path / "out"
     code = f"""
-import test_evaluation as t
+import test_protocol as t
 from pathlib import Path
 t.play(output=Path({str(out)!r}), workers=1, delay=0.01)
 """

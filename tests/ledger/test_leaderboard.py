@@ -17,7 +17,8 @@ import pytest
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.protocol import evaluate
 from rl2grid.ledger.leaderboard import check_entry, find_evaluation, make_entry, verify_entry
-from rl2grid.records.entries import FACTS, episode_hash, read_entry, write_entry
+from rl2grid.records.entries import episode_hash, read_entry, write_entry
+from rl2grid.records.episodes import FACTS
 from rl2grid.records.evaluations import identity_hash
 
 MONTHS = ["generated/700000-00", "generated/700003-09"]
@@ -51,7 +52,7 @@ def rehash(contents: Contents) -> None:
     """What a careful forger would do after a change."""
     contents["identity_hash"] = identity_hash(contents["identity"])
     for episode in contents["episodes"]:
-        episode["hash"] = episode_hash({name: episode[name] for name in FACTS})
+        episode["hash"] = episode_hash({column.name: episode[column.name] for column in FACTS})
 
 
 def unpack(episode: Contents) -> Any:
@@ -77,7 +78,7 @@ def test_stored_actions_make_the_same_episodes(folder, name):
 
 
 def test_an_entry_is_the_evaluation(folder, contents):
-    result = read_entry(folder / "discrete.json").result
+    result = read_entry(folder / "discrete.json").evaluation
     assert [(one.scenario, one.seed) for one in result.episodes] == [(month, s) for month in MONTHS for s in (0, 1)]
     assert result.identity == json.loads((folder / "discrete" / "evaluation.json").read_text())["identity"]
     assert contents["training"] is None
@@ -85,7 +86,7 @@ def test_an_entry_is_the_evaluation(folder, contents):
 
 
 def test_a_name_of_its_own_is_kept(folder):
-    assert make_entry(folder / "discrete", label="dice").result.summary.agent == "dice"
+    assert make_entry(folder / "discrete", label="dice").evaluation.summary.agent == "dice"
 
 
 def _survival(contents: Contents) -> None:

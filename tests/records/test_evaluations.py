@@ -11,7 +11,7 @@ from sample_results import episode, result
 
 from rl2grid.analysis.summary_table import HEADINGS, markdown_table, rich_table
 from rl2grid.errors import UsageError
-from rl2grid.records.episodes import COLUMNS, read_episodes, write_episodes
+from rl2grid.records.episodes import COLUMN_NAMES, read_episodes, write_episodes
 from rl2grid.records.evaluations import check_comparable, load_evaluation
 from rl2grid.records.summary import by_scenario, summarise
 from rl2grid.records.trainings import read_training_curve, read_validations
@@ -31,9 +31,11 @@ def test_a_torn_last_line_is_ignored(tmp_path):
     assert [row.seed for row in read_episodes(path)] == [0]
 
 
+HEADER = ",".join(COLUMN_NAMES) + "\n"
+
+
 @pytest.mark.parametrize(
-    "text",
-    ["", "a,b\n1,2\n", ",".join(COLUMNS) + "\n1,2\n", ",".join(COLUMNS) + "\n" + ",".join(["x"] * len(COLUMNS)) + "\n"],
+    "text", ["", "a,b\n1,2\n", f"{HEADER}1,2\n", HEADER + ",".join(["x"] * len(COLUMN_NAMES)) + "\n"]
 )
 def test_other_files_are_refused(tmp_path, text):
     path = tmp_path / "episodes.csv"

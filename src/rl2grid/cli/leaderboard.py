@@ -95,7 +95,7 @@ def _verify(options: argparse.Namespace) -> int:
             different += 1
             print(f"rl2grid: {path} is not verified: {difference}.", file=sys.stderr)
         else:
-            survival, episodes = entry.result.summary.survival.value, len(entry.episodes)
+            survival, episodes = entry.evaluation.summary.survival.value, len(entry.episodes)
             print(
                 f"{path} is verified: survival {survival:.3f} in {episodes} of {episodes} episodes, exactly as stored."
             )
@@ -107,7 +107,7 @@ def _table(options: argparse.Namespace) -> int:
 
     by_task: dict[str, dict[Path, Evaluation]] = {}
     for path, entry in _read(options.files).items():
-        by_task.setdefault(entry.identity["task"], {})[path] = entry.result
+        by_task.setdefault(entry.identity["task"], {})[path] = entry.evaluation
     for results in by_task.values():
         check_comparable(list(results.values()))
     console = Console()

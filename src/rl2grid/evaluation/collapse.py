@@ -15,7 +15,7 @@ LIMIT = np.float32(1.0)
 
 
 class Collapse(NamedTuple):
-    """Ids in words, in order and separated by spaces; see :class:`rl2grid.records.episodes.Episode`."""
+    """Ids in words, in order and separated by spaces; see :data:`rl2grid.records.episodes.COLUMNS`."""
 
     last_overloads: str = ""
     last_outages: str = ""

@@ -25,7 +25,8 @@ from rl2grid.agents.agent import Action, Agent, Info
 from rl2grid.envs.registration import register_all
 from rl2grid.envs.worker import take_standard_streams
 from rl2grid.errors import UsageError
-from rl2grid.evaluation.episode import PlayedEpisode, play_episode
+from rl2grid.evaluation.episode import play_episode
+from rl2grid.records.episodes import Episode
 
 _REPORT_SECONDS = 0.5
 
@@ -69,7 +70,7 @@ OnProgress = Callable[[Progress], None]
 class Crew(Protocol):
     """Plays episodes and tells of them as they go."""
 
-    def play(self, jobs: Sequence[Job], on_progress: OnProgress) -> Iterator[PlayedEpisode]:
+    def play(self, jobs: Sequence[Job], on_progress: OnProgress) -> Iterator[Episode]:
         """Play all jobs, in no particular order; ``on_progress`` is told of running ones at most twice a second.
 
         Raises:
@@ -102,7 +103,7 @@ class BoundAgent:
             self._env.close()
             raise
 
-    def play(self, job: Job, on_progress: OnProgress) -> PlayedEpisode:
+    def play(self, job: Job, on_progress: OnProgress) -> Episode:
         """Play an episode."""
         told = time.monotonic()
 
@@ -128,7 +129,7 @@ class LocalCrew:
         self._setting = setting
         self._agent: BoundAgent | None = None
 
-    def play(self, jobs: Sequence[Job], on_progress: OnProgress) -> Iterator[PlayedEpisode]:
+    def play(self, jobs: Sequence[Job], on_progress: OnProgress) -> Iterator[Episode]:
         """See :class:`Crew`."""
         self._agent = BoundAgent(self._setting)
         for job in jobs:
@@ -150,7 +151,7 @@ class WorkerCrew:
         self._answers: queue.SimpleQueue[tuple[_Worker, str, Any]] = queue.SimpleQueue()
         self._running: list[_Worker] = []
 
-    def play(self, jobs: Sequence[Job], on_progress: OnProgress) -> Iterator[PlayedEpisode]:
+    def play(self, jobs: Sequence[Job], on_progress: OnProgress) -> Iterator[Episode]:
         """See :class:`Crew`."""
         waiting = list(reversed(jobs))
         open_jobs = len(waiting)

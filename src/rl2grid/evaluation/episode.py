@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
@@ -13,39 +12,10 @@ import gymnasium
 from rl2grid.agents.agent import Action, Agent, Info, RandomizedAgent, no_intervention
 from rl2grid.evaluation.collapse import COMPLETED, collapse, overloaded_lines
 from rl2grid.mdp.termination import GameOver
+from rl2grid.records.episodes import Episode
 
 OnDecision = Callable[[Action, Info], None]
 """Called with every action of the agent and the ``info`` on which it was chosen."""
-
-
-@dataclass(frozen=True)
-class PlayedEpisode:
-    """What happened in an episode; see :class:`rl2grid.records.episodes.Episode` for the meaning and units."""
-
-    scenario: str
-    seed: int
-    start: int
-    episode_length: int
-    grid_steps: int
-    decisions: int
-    survival: float
-    completed: bool
-    game_over: str
-    last_overloads: str
-    last_outages: str
-    last_cut_off: str
-    episode_return: float
-    return_survive: float
-    return_overload: float
-    return_cost: float
-    cost_lsi: float
-    cost_tlo: float
-    score_margin: float
-    score_overload: float
-    score_topology: float
-    illegal: int
-    ambiguous: int
-    wall_time_s: float
 
 
 def play_episode(
@@ -56,7 +26,7 @@ def play_episode(
     seed: int,
     start: int = 0,
     on_decision: OnDecision | None = None,
-) -> PlayedEpisode:
+) -> Episode:
     """Play one episode with an agent that is bound to ``env``.
 
     Everything that a transition accrued counts, heuristic steps and those before the first decision
@@ -71,6 +41,9 @@ def play_episode(
         start: row at which the episode begins.
         on_decision: called at every decision.
 
+    Returns:
+        What happened, without the labels of an evaluation.
+
     Raises:
         UsageError: the scenario is not in the split of ``env``, or leaves nothing to play after ``start``.
     """
@@ -80,7 +53,7 @@ def play_episode(
     options = {"scenario": scenario, "start": start}
     observation, info = env.reset(seed=environment_seed(scenario, seed), options=options)
     agent.reset(0)
-    totals: dict[str, float] = dict.fromkeys(_TOTALS, 0.0)
+    totals: dict[str, Any] = dict.fromkeys(_TOTALS, 0.0)
     decisions = illegal = ambiguous = 0
     over = False
     state = env.unwrapped.state  # type: ignore[attr-defined]
@@ -101,7 +74,7 @@ def play_episode(
         illegal += int(info["illegal"])
         ambiguous += int(info["ambiguous"])
     ending = collapse(state, 0, overloads if info["step"] == decided + 1 else "") if terminated else COMPLETED
-    return PlayedEpisode(
+    return Episode(
         scenario=scenario,
         seed=seed,
         start=start,
@@ -132,7 +105,7 @@ def environment_seed(scenario: str, seed: int) -> int:
 _TOTALS = ("episode_return", "return_survive", "return_overload", "return_cost", "cost_lsi", "cost_tlo")
 
 
-def _add(totals: dict[str, float], reward: float, info: Info) -> None:
+def _add(totals: dict[str, Any], reward: float, info: Info) -> None:
     components, costs = info["reward_components"], info["costs"]
     totals["episode_return"] += reward
     totals["return_survive"] += components["survive"]

@@ -20,7 +20,7 @@ import os
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,10 +33,9 @@ from rl2grid.envs.tasks import Task, constraint_of, find_task
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import make_agent
 from rl2grid.evaluation.crew import Job, Progress, Setting, make_crew
-from rl2grid.evaluation.episode import PlayedEpisode
 from rl2grid.mdp.actions import action_set_hash
 from rl2grid.records.episodes import EPISODES_FILE, Episode, format_row, read_episodes, write_episodes
-from rl2grid.records.evaluations import EVALUATION_FILE, Evaluation, identity_hash, read_request, write_evaluation
+from rl2grid.records.evaluations import EVALUATION_FILE, Evaluation, labels, read_request, write_evaluation
 from rl2grid.records.files import check_folder, make_folder
 from rl2grid.records.summary import Summary, summarise
 from rl2grid.records.versions import library_versions
@@ -139,8 +138,8 @@ def run_evaluation(
         output: folder; None: nothing is stored.
         progress: whether to show a progress bar.
     """
-    digest = identity_hash(identity)
-    request = {"identity": dict(identity), "identity_hash": digest, "jobs": [list(job) for job in jobs]}
+    of_all = labels(identity)
+    request = {"identity": dict(identity), "identity_hash": of_all["identity"], "jobs": [list(job) for job in jobs]}
     with _store(output, request, command) as store, _display(setting, jobs, progress) as display:
         done = {_job(episode): episode for episode in store.episodes}
         display.skip(done)
@@ -148,7 +147,7 @@ def run_evaluation(
         if missing:
             with make_crew(setting, workers) as crew:
                 for played in crew.play(missing, display.advance):
-                    episode = _row(played, identity, digest)
+                    episode = replace(played, **of_all)
                     store.add(episode)
                     display.finish(episode)
                     done[_job(episode)] = episode
@@ -246,22 +245,6 @@ def _call(
         arguments["name"] = name
     words = ", ".join(f"{key}={value!r}" for key, value in arguments.items())
     return f"evaluate({shown}, {task.id!r}, {words})"
-
-
-def _row(played: PlayedEpisode, identity: Mapping[str, Any], digest: str) -> Episode:
-    agent_identity = identity["agent_identity"]
-    return Episode(
-        task=identity["task"],
-        agent=identity["agent"],
-        heuristic=identity["heuristic"] or "none",
-        split=identity["split"],
-        engine=identity["engine"],
-        scenario_pack_hash=identity["scenario_pack_hash"],
-        action_set_hash=identity["action_set_hash"] or "",
-        agent_hash=identity_hash(agent_identity) if agent_identity else "",
-        identity=digest,
-        **asdict(played),
-    )
 
 
 def _job(episode: Episode) -> Job:

@@ -22,12 +22,11 @@ from rl2grid.envs.registration import register_all
 from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import AGENTS, make_agent
-from rl2grid.evaluation.episode import PlayedEpisode, play_episode
+from rl2grid.evaluation.episode import play_episode
 from rl2grid.evaluation.protocol import question
 from rl2grid.mdp.rewards import resolve_reward
 from rl2grid.records.collection import CELL_FILE, EVALUATION_FOLDER, RUN_FOLDER, find_evaluations
 from rl2grid.records.entries import (
-    FACTS,
     Actions,
     Entry,
     PlayedActions,
@@ -93,14 +92,14 @@ def make_entry(
         player.bind(env)
         for number, episode in enumerate(result.episodes):
             kept: list[Action] = []
-            facts = _play(player, env, facts_of(episode), kept, _after(number, on_progress))
-            difference = _difference(facts_of(episode), facts)
+            again = _play(player, env, episode, kept, _after(number, on_progress))
+            difference = _difference(episode, again)
             if difference:
                 raise UsageError(
                     f"Episode {episode.scenario}, seed {episode.seed} of {evaluation} is played differently now: "
                     f"{difference}{_other_versions(result.identity)}."
                 )
-            played.append(PlayedActions(facts, _as_array(kept, task)))
+            played.append(PlayedActions(again, _as_array(kept, task)))
     on_progress(len(played))
     return Entry(
         label or result.episodes[0].agent,
@@ -122,7 +121,7 @@ def check_entry(entry: Entry, name: str) -> None:
         UsageError: what is different.
     """
     task, keywords = find_task(entry.identity["task"]), _keywords(entry.identity, name)
-    scenarios = _scenarios(entry.result.episodes)
+    scenarios = _scenarios(entry.evaluation.episodes)
     for scenario in scenarios:
         try:
             check_in_split(task.grid_id, keywords["split"], scenario)
@@ -131,7 +130,7 @@ def check_entry(entry: Entry, name: str) -> None:
     _check_question(task, keywords, entry.identity, scenarios, name)
     for episode in entry.episodes:
         _check_actions(episode, task, name)
-        if episode.facts["start"] != entry.identity["start"]:
+        if episode.episode.start != entry.identity["start"]:
             raise UsageError(f"{name} was changed: episode {episode.name} begins at another row.")
 
 
@@ -150,12 +149,12 @@ def verify_entry(entry: Entry, on_progress: OnProgress = lambda played: None) ->
         for number, stored in enumerate(entry.episodes):
             agent = _StoredActions(stored.actions)
             try:
-                facts = _play(agent, env, stored.facts, [], _after(number, on_progress))
+                again = _play(agent, env, stored.episode, [], _after(number, on_progress))
             except _NoMoreActionsError:
                 return f"Episode {stored.name} goes on after its {len(stored.actions)} stored actions"
             except UsageError as error:
                 return f"Episode {stored.name} cannot be played: {str(error).removesuffix('.')}"
-            difference = _difference(stored.facts, facts)
+            difference = _difference(stored.episode, again)
             if difference:
                 return f"Episode {stored.name} differs: {difference}{_other_versions(entry.identity)}"
     on_progress(len(entry.episodes))
@@ -193,28 +192,24 @@ def _after(played: int, on_progress: OnProgress) -> OnProgress:
     return lambda share: on_progress(played + share)
 
 
-def _play(
-    agent: Agent, env: gymnasium.Env[Any, Any], asked: Mapping[str, Any], kept: list[Action], tell: OnProgress
-) -> dict[str, Any]:
-    """Play one episode, keep the actions, and return the facts."""
+def _play(agent: Agent, env: gymnasium.Env[Any, Any], asked: Episode, kept: list[Action], tell: OnProgress) -> Episode:
+    """Play an episode again and keep the actions."""
 
     def note(action: Action, info: Info) -> None:
         kept.append(np.array(action))
         tell(int(info["step"]) / int(info["episode_length"]))
 
-    played: PlayedEpisode = play_episode(
-        agent, env, scenario=asked["scenario"], seed=asked["seed"], start=asked["start"], on_decision=note
-    )
-    return facts_of(played)
+    return play_episode(agent, env, scenario=asked.scenario, seed=asked.seed, start=asked.start, on_decision=note)
 
 
-def _difference(stored: Mapping[str, Any], played: Mapping[str, Any]) -> str:
+def _difference(stored: Episode, played: Episode) -> str:
     """What is not the same, in words; nothing if all is."""
-    for name in ("survival", *FACTS):
-        if stored[name] != played[name]:
-            return f"its {name} is stored as {stored[name]!r}, played again it is {played[name]!r}"
-    if episode_hash(stored) != episode_hash(played):
-        return f"its hash is stored as {episode_hash(stored)}, played again it is {episode_hash(played)}"
+    then, now = facts_of(stored), facts_of(played)
+    for name in ("survival", *then):
+        if then[name] != now[name]:
+            return f"its {name} is stored as {then[name]!r}, played again it is {now[name]!r}"
+    if episode_hash(then) != episode_hash(now):
+        return f"its hash is stored as {episode_hash(then)}, played again it is {episode_hash(now)}"
     return ""
 
 

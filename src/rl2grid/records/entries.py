@@ -13,7 +13,7 @@ import hashlib
 import json
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rl2grid.errors import UsageError
-from rl2grid.records.episodes import COLUMNS, Episode
-from rl2grid.records.evaluations import Evaluation, identity_hash
+from rl2grid.records.episodes import FACTS, Episode
+from rl2grid.records.evaluations import Evaluation, identity_hash, labels
 from rl2grid.records.files import write_json
 
 FORMAT, VERSION = "rl2grid leaderboard entry", 1
@@ -32,27 +32,21 @@ MAX_BYTES = 500_000_000
 Actions = NDArray[Any]
 """Unsigned integers [decision] on topology tasks, float32 [decision, continuous] on redispatching tasks."""
 
-_OF_THE_EVALUATION = frozenset(
-    {"task", "agent", "heuristic", "split", "engine", "scenario_pack_hash", "action_set_hash", "agent_hash", "identity"}
-)
-FACTS: tuple[str, ...] = tuple(name for name in COLUMNS if name not in {*_OF_THE_EVALUATION, "wall_time_s"})
-"""Columns of :class:`~rl2grid.records.episodes.Episode` that the environment and the actions alone decide."""
-_TYPES = {name: Episode.__annotations__[name] for name in FACTS}
-_ALLOWED = {"str": (str,), "int": (int,), "float": (int, float), "bool": (bool,)}
+_ALLOWED: dict[type, tuple[type, ...]] = {str: (str,), int: (int,), float: (int, float), bool: (bool,)}
 
 
 @dataclass(frozen=True, eq=False)
 class PlayedActions:
     """What happened in an episode, and the actions that made it happen."""
 
-    facts: Mapping[str, Any]
-    """By name in :data:`FACTS`."""
+    episode: Episode
+    """Without the labels of an evaluation."""
     actions: Actions
 
     @property
     def name(self) -> str:
         """What messages call it."""
-        return f"{self.facts['scenario']}, seed {self.facts['seed']}"
+        return f"{self.episode.scenario}, seed {self.episode.seed}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,27 +64,16 @@ class Entry:
     episodes: tuple[PlayedActions, ...]
 
     @functools.cached_property
-    def result(self) -> Evaluation:
+    def evaluation(self) -> Evaluation:
         """The evaluation, as tables take it; the time that episodes took is unknown, 0."""
-        identity, agent = self.identity, self.identity["agent_identity"]
-        words = {
-            "task": identity["task"],
-            "agent": self.label,
-            "heuristic": identity["heuristic"] or "none",
-            "split": identity["split"],
-            "engine": identity["engine"],
-            "scenario_pack_hash": identity["scenario_pack_hash"],
-            "action_set_hash": identity["action_set_hash"] or "",
-            "agent_hash": identity_hash(agent) if agent else "",
-            "identity": identity_hash(identity),
-        }
-        episodes = tuple(Episode(**words, **one.facts, wall_time_s=0.0) for one in self.episodes)
-        return Evaluation(episodes, identity, self.command)
+        words = {**labels(self.identity), "agent": self.label}
+        episodes = tuple(replace(one.episode, wall_time_s=0.0, **words) for one in self.episodes)
+        return Evaluation(episodes, self.identity, self.command)
 
 
-def facts_of(episode: Any) -> dict[str, Any]:
-    """The facts of an episode, played or read."""
-    return {name: getattr(episode, name) for name in FACTS}
+def facts_of(episode: Episode) -> dict[str, Any]:
+    """The facts of an episode, by the names of :data:`~rl2grid.records.episodes.FACTS`."""
+    return {column.name: getattr(episode, column.name) for column in FACTS}
 
 
 def episode_hash(facts: Mapping[str, Any]) -> str:
@@ -98,7 +81,7 @@ def episode_hash(facts: Mapping[str, Any]) -> str:
 
     The sums and means over its grid steps are among the facts, so that any difference on the way shows.
     """
-    values = [float(facts[name]) if _TYPES[name] == "float" else facts[name] for name in FACTS]
+    values = [float(facts[name]) if kind is float else facts[name] for name, kind, *_ in FACTS]
     return hashlib.sha256(json.dumps(values).encode()).hexdigest()[:16]
 
 
@@ -112,7 +95,7 @@ def write_entry(path: Path, entry: Entry) -> None:
         "identity_hash": identity_hash(entry.identity),
         "command": entry.command,
         "training": entry.training,
-        "episodes": [{**one.facts, "hash": episode_hash(one.facts), **_packed(one.actions)} for one in entry.episodes],
+        "episodes": [_stored(one) for one in entry.episodes],
     }
     write_json(path, contents, indent=1)
 
@@ -155,29 +138,34 @@ def _parse(path: Path, contents: Mapping[str, Any]) -> Entry:
     episodes = tuple(_episode(path, stored) for stored in contents["episodes"])
     if not episodes:
         raise UsageError(f"{path} is an entry without episodes.")
-    keys = {(one.facts["scenario"], one.facts["seed"], one.facts["start"]) for one in episodes}
+    keys = {(one.episode.scenario, one.episode.seed, one.episode.start) for one in episodes}
     if len(keys) != len(episodes):
         raise UsageError(f"{path} was changed: it has an episode twice.")
     entry = Entry(str(contents["label"]), identity, str(contents["command"]), contents["training"], episodes)
-    _ = entry.result.summary  # refuses what is no table of scenarios and seeds
+    _ = entry.evaluation.summary  # refuses what is no table of scenarios and seeds
     return entry
 
 
+def _stored(played: PlayedActions) -> dict[str, Any]:
+    facts = facts_of(played.episode)
+    return {**facts, "hash": episode_hash(facts), **_packed(played.actions)}
+
+
 def _episode(path: Path, stored: Mapping[str, Any]) -> PlayedActions:
-    facts = {name: stored[name] for name in FACTS}
-    for name, value in facts.items():
-        allowed = _ALLOWED[_TYPES[name]]
+    facts = {column.name: stored[column.name] for column in FACTS}
+    for column in FACTS:
+        value, allowed = facts[column.name], _ALLOWED[column.type]
         if not isinstance(value, allowed) or (isinstance(value, bool) and bool not in allowed):
-            raise UsageError(f"{path} is a damaged entry of a leaderboard: {name} is {value!r}.")
-    episode = PlayedActions(facts, _unpacked(stored))
+            raise UsageError(f"{path} is a damaged entry of a leaderboard: {column.name} is {value!r}.")
+    played = PlayedActions(Episode(**facts, wall_time_s=0.0), _unpacked(stored))
     if episode_hash(facts) != stored["hash"]:
-        raise UsageError(f"{path} was changed: the episode {episode.name} does not have the hash {stored['hash']!r}.")
-    if len(episode.actions) != facts["decisions"]:
+        raise UsageError(f"{path} was changed: the episode {played.name} does not have the hash {stored['hash']!r}.")
+    if len(played.actions) != played.episode.decisions:
         raise UsageError(
-            f"{path} was changed: the episode {episode.name} has {facts['decisions']} decisions and "
-            f"{len(episode.actions)} actions."
+            f"{path} was changed: the episode {played.name} has {played.episode.decisions} decisions and "
+            f"{len(played.actions)} actions."
         )
-    return episode
+    return played
 
 
 def _packed(actions: Actions) -> dict[str, Any]:

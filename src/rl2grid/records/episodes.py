@@ -1,4 +1,8 @@
-"""Tidy episode files: one row per episode, the raw material of every table and figure."""
+"""Tidy episode files: one row per episode, the raw material of every table and figure.
+
+:class:`Episode` declares every column once, with its type, its unit, its meaning and what decides it. The files, what
+entries of a leaderboard hold (:data:`FACTS`) and the table of the documentation follow from that.
+"""
 
 from __future__ import annotations
 
@@ -6,81 +10,110 @@ import csv
 import io
 import os
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
+from enum import StrEnum
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any, NamedTuple, get_type_hints
 
 from rl2grid.errors import UsageError
 
 EPISODES_FILE = "episodes.csv"
 
 
-@dataclass(frozen=True)
+class Origin(StrEnum):
+    """What decides a column."""
+
+    EVALUATION = "evaluation"
+    """The evaluation that the episode is part of: equal in all its rows; empty outside of one."""
+    EPISODE = "episode"
+    """The environment and the actions alone: who plays the actions again finds the same, to the last bit."""
+    CLOCK = "clock"
+    """Nothing that a repetition reproduces."""
+
+
+class Column(NamedTuple):
+    """A column of a file of episodes."""
+
+    name: str
+    type: type
+    """``str``, ``int``, ``float`` or ``bool``."""
+    unit: str
+    """Empty where there is none."""
+    meaning: str
+    origin: Origin
+
+
+def _fact(meaning: str, unit: str = "", origin: Origin = Origin.EPISODE) -> Any:
+    return field(metadata={"meaning": meaning, "unit": unit, "origin": origin})
+
+
+def _label(meaning: str) -> Any:
+    return field(default="", metadata={"meaning": meaning, "unit": "", "origin": Origin.EVALUATION})
+
+
+@dataclass(frozen=True, kw_only=True)
 class Episode:
-    """One evaluated episode. Powers are in MW, durations in grid steps of five minutes unless said otherwise."""
+    """One episode as it was played, and as it is stored; :data:`COLUMNS` says what its columns mean.
 
-    task: str
-    agent: str
-    heuristic: str
-    """``none``, ``idle`` or ``recovery``."""
-    split: str
-    scenario: str
-    seed: int
-    start: int
-    """Row of the scenario at which the episode begins."""
-    episode_length: int
-    """Steps of a completed episode, T."""
-    grid_steps: int
-    """Steps played, heuristic steps and the step of a game over included."""
-    decisions: int
-    """Actions asked of the agent; 0 when the episode ended before its first decision."""
-    survival: float
-    """Share of the episode survived, 0 to 1."""
-    completed: bool
-    """Whether the last step was reached without a game over."""
-    game_over: str
-    """Name of the :class:`~rl2grid.mdp.termination.GameOver` reason; ``NONE`` when completed."""
-    last_overloads: str
-    """Lines above their limit in the state before the game over: ids in order, separated by spaces. Empty where
-    there were none, as when a sound grid is attacked, and when the episode was completed; so are the next two."""
-    last_outages: str
-    """Lines out of service when the grid collapsed, by protection, attack, maintenance or choice."""
-    last_cut_off: str
-    """Substations where a load or generator was off, or something was not connected to the balancing generator."""
-    episode_return: float
-    """Sum of the rewards of all grid steps."""
-    return_survive: float
-    """Sum of the first reward component, without its weight."""
-    return_overload: float
-    return_cost: float
-    cost_lsi: float
-    """Sum of the costs of load shedding and islanding."""
-    cost_tlo: float
-    """Sum of the costs of transmission line overloads."""
-    score_margin: float
-    """Mean per step of the paper's margin score (Section 5)."""
-    score_overload: float
-    score_topology: float
-    illegal: int
-    """Actions of the agent that broke a rule."""
-    ambiguous: int
-    wall_time_s: float
-    """Seconds that the episode took; the only column that a repetition does not reproduce."""
-    engine: str
-    scenario_pack_hash: str
-    action_set_hash: str
-    agent_hash: str
-    """Of the checkpoint; empty for agents without parameters."""
-    identity: str
-    """Hash of the evaluation's full identity, which is stored beside the rows."""
+    Its labels (:attr:`Origin.EVALUATION`) are empty until it becomes part of an evaluation.
+    """
+
+    task: str = _label("id of the task")
+    agent: str = _label("what tables call the agent")
+    heuristic: str = _label("`none`, `idle` or `recovery`")
+    split: str = _label("split of the month")
+    scenario: str = _fact("the month")
+    seed: int = _fact("of maintenance, opponent and agent, together with the month")
+    start: int = _fact("row of the scenario at which the episode begins")
+    episode_length: int = _fact("steps of a completed episode, T", "grid steps")
+    grid_steps: int = _fact("steps played, heuristic steps and the step of a game over included", "grid steps")
+    decisions: int = _fact("actions asked of the agent; 0 when the episode ended before its first decision")
+    survival: float = _fact("share of the episode survived, 0 to 1")
+    completed: bool = _fact("whether the last step was reached without a game over")
+    game_over: str = _fact("reason of the game over; `NONE` when completed")
+    last_overloads: str = _fact("lines above their limit in the state before the game over", "ids")
+    last_outages: str = _fact(
+        "lines out of service when the grid collapsed, by protection, attack, maintenance or choice", "ids"
+    )
+    last_cut_off: str = _fact(
+        "substations where a load or generator was off, or something was not connected to the balancing generator",
+        "ids",
+    )
+    episode_return: float = _fact("sum of the rewards of all grid steps")
+    return_survive: float = _fact("sum of the first component of the reward, without its weight")
+    return_overload: float = _fact("sum of the second")
+    return_cost: float = _fact("sum of the third")
+    cost_lsi: float = _fact("sum of the costs of load shedding and islanding")
+    cost_tlo: float = _fact("sum of the costs of transmission line overloads")
+    score_margin: float = _fact("margin score of the paper (Section 5), mean per step")
+    score_overload: float = _fact("its overload score")
+    score_topology: float = _fact("its topology score")
+    illegal: int = _fact("actions of the agent that broke a rule")
+    ambiguous: int = _fact("actions of the agent that contradicted themselves")
+    wall_time_s: float = _fact("time that the episode took", "s", Origin.CLOCK)
+    engine: str = _label("`native` or `reference`")
+    scenario_pack_hash: str = _label("of the series")
+    action_set_hash: str = _label("of the topology actions; empty without any")
+    agent_hash: str = _label("of the checkpoint; empty for agents without parameters")
+    identity: str = _label("hash of the evaluation's full identity, which is stored beside the rows")
 
 
-COLUMNS: tuple[str, ...] = tuple(field.name for field in fields(Episode))
+_TYPES: dict[str, type] = get_type_hints(Episode)
+COLUMNS: tuple[Column, ...] = tuple(
+    Column(each.name, _TYPES[each.name], each.metadata["unit"], each.metadata["meaning"], each.metadata["origin"])
+    for each in fields(Episode)
+)
+"""In the order of the files."""
+COLUMN_NAMES: tuple[str, ...] = tuple(column.name for column in COLUMNS)
+LABELS: tuple[Column, ...] = tuple(column for column in COLUMNS if column.origin is Origin.EVALUATION)
+"""Columns that the evaluation decides, of which an episode is part."""
+FACTS: tuple[Column, ...] = tuple(column for column in COLUMNS if column.origin is Origin.EPISODE)
+"""Columns that the environment and the actions alone decide."""
 
 
 def write_episodes(path: Path, episodes: Iterable[Episode]) -> None:
     """Write a file of episodes, whole or not at all."""
-    text = ",".join(COLUMNS) + "\n" + "".join(map(format_row, episodes))
+    text = ",".join(COLUMN_NAMES) + "\n" + "".join(map(format_row, episodes))
     temporary = path.with_name(f"{path.name}.tmp")
     temporary.write_text(text, encoding="utf-8")
     os.replace(temporary, path)
@@ -97,8 +130,8 @@ def read_episodes(path: Path) -> tuple[Episode, ...]:
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"{path} cannot be read as a file of episodes: {error}.") from None
     rows = list(csv.reader(io.StringIO(text[: text.rfind("\n") + 1])))
-    if not rows or tuple(rows[0]) != COLUMNS:
-        raise UsageError(f"{path} is no file of episodes: its first line must be {','.join(COLUMNS)}.")
+    if not rows or tuple(rows[0]) != COLUMN_NAMES:
+        raise UsageError(f"{path} is no file of episodes: its first line must be {','.join(COLUMN_NAMES)}.")
     return tuple(_parse_row(path, number, row) for number, row in enumerate(rows[1:], start=2))
 
 
@@ -113,12 +146,9 @@ def _format(value: Any) -> Any:
     return str(value).lower() if isinstance(value, bool) else value
 
 
-_TYPES: dict[str, type] = get_type_hints(Episode)
-
-
 def _parse_row(path: Path, number: int, row: list[str]) -> Episode:
     try:
-        values = {name: _parse(_TYPES[name], text) for name, text in zip(COLUMNS, row, strict=True)}
+        values = {column.name: _parse(column.type, text) for column, text in zip(COLUMNS, row, strict=True)}
     except ValueError as error:
         raise UsageError(f"Line {number} of {path} is no episode: {error}.") from None
     return Episode(**values)

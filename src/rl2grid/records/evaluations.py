@@ -43,6 +43,22 @@ def identity_hash(identity: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:16]
 
 
+def labels(identity: Mapping[str, Any]) -> dict[str, Any]:
+    """What an evaluation with this identity decides of its episodes: :data:`~rl2grid.records.episodes.LABELS`."""
+    agent = identity["agent_identity"]
+    return {
+        "task": identity["task"],
+        "agent": identity["agent"],
+        "heuristic": identity["heuristic"] or "none",
+        "split": identity["split"],
+        "engine": identity["engine"],
+        "scenario_pack_hash": identity["scenario_pack_hash"],
+        "action_set_hash": identity["action_set_hash"] or "",
+        "agent_hash": identity_hash(agent) if agent else "",
+        "identity": identity_hash(identity),
+    }
+
+
 def write_evaluation(path: Path, request: Mapping[str, Any], summary: Summary | None) -> None:
     """Write the description of an evaluation, with its aggregates once it is complete."""
     record = {**request, "complete": summary is not None, "summary": asdict(summary) if summary else None}

@@ -27,7 +27,7 @@ from rich.table import Table
 from rich.text import Text
 
 from rl2grid.records.collection import EVALUATION_FOLDER, RUN_FOLDER, STUDY_FILE
-from rl2grid.records.episodes import COLUMNS, EPISODES_FILE, format_row, read_episodes
+from rl2grid.records.episodes import COLUMN_NAMES, EPISODES_FILE, format_row, read_episodes
 from rl2grid.records.files import make_folder, write_json
 from rl2grid.records.trainings import METRICS_FILE, VALIDATION
 from rl2grid.records.versions import library_versions
@@ -342,7 +342,7 @@ def _recorded_failures(path: Path) -> dict[str, str]:
 def _write_episodes(path: Path, states: Sequence[CellState]) -> None:
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     with temporary.open("w", encoding="utf-8", newline="") as file:
-        file.write(",".join(("cell", "training_seed", *COLUMNS)) + "\n")
+        file.write(",".join(("cell", "training_seed", *COLUMN_NAMES)) + "\n")
         for state in states:
             if state.result is None:
                 continue
