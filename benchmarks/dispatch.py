@@ -30,11 +30,10 @@ from grid2op.Environment.dispatch import (
 from lightsim2grid import LightSimBackend
 from numpy.typing import NDArray
 
+from rl2grid.arrays import F64
 from rl2grid.engines.dispatch import EPSILON, find_dispatch
 from rl2grid.engines.reference.dispatch import ExactRedispatchSolver
 from rl2grid.grids import GRID_IDS, Grid, load_grid
-
-Doubles = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -86,19 +85,19 @@ class Problem:
 class Programme:
     """The quadratic programme of a problem over its participating generators, from Grid2Op's formulas."""
 
-    goal: Doubles
-    flexibility: Doubles
-    lower: Doubles
-    upper: Doubles
+    goal: F64
+    flexibility: F64
+    lower: F64
+    upper: F64
     costly: NDArray[np.bool_]
     """Generators in the objective."""
     power: float
 
-    def objective(self, change: Doubles) -> float:
+    def objective(self, change: F64) -> float:
         """Squared distance to the goals, weighted by the inverse of the ramps, MW."""
         return float((((change - self.goal) ** 2 / self.flexibility)[self.costly]).sum())
 
-    def violation(self, change: Doubles) -> float:
+    def violation(self, change: F64) -> float:
         """Largest violation of a bound or of the sum, MW."""
         bounds = max(float((self.lower - change).max()), float((change - self.upper).max()), 0.0)
         return max(bounds, abs(float(change.sum()) - self.power))

@@ -23,8 +23,8 @@ os.environ["OPENBLAS_NUM_THREADS"] = "1"
 import lightsim2grid
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
+from rl2grid.arrays import F32, I32
 from rl2grid.engines.reference.extract import make_environment
 from rl2grid.grids import Grid, load_grid
 from rl2grid.powerflow.ac import CONVERGED, FlowState, new_flow_state, run_flow, write_currents, write_flow
@@ -32,8 +32,6 @@ from rl2grid.powerflow.model import Network, load_network
 from rl2grid.scenarios.library import list_scenarios, load_scenario
 
 GRIDS = ("bus14", "bus36-M", "bus118-M", "bus118-MOB-v1")
-I32 = NDArray[np.int32]
-F32 = NDArray[np.float32]
 Rows = tuple[F32, Any, F32, F32, F32]
 
 

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rl2grid.arrays import F64
 from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.engines.native.entry import reset_one, step_one
 from rl2grid.engines.native.series import outages_of
@@ -45,7 +46,6 @@ from rl2grid.scenarios.maintenance import sample_maintenance
 from rl2grid.scenarios.scenario import Scenario
 from rl2grid.streams import Purpose, Stream
 
-Floats = NDArray[np.float64]
 KINDS = ("nuclear", "hydro", "thermal", "wind", "solar")
 
 DATA = Path(__file__).resolve().parents[1] / "src" / "rl2grid" / "scenarios" / "generator" / "data"
@@ -150,7 +150,7 @@ def day_parts(scenario: Scenario, year: int) -> tuple[NDArray[np.int64], NDArray
     return row, (minutes // 60) % 24, np.maximum(weekday - 4, 0)
 
 
-def kinds_of_day() -> Floats:
+def kinds_of_day() -> F64:
     """[3, 24] demand on working days, Saturdays and Sundays relative to working days, from the bundled months."""
     totals = np.zeros((3, 24))
     counts = np.zeros((3, 24))
@@ -235,7 +235,7 @@ def fit_demand(grid: Grid, scenarios: list[Scenario]) -> dict[str, Any]:
     }
 
 
-def unusual_surplus(grid: Grid, signed: NDArray[np.int64], scenarios: list[Scenario]) -> Floats:
+def unusual_surplus(grid: Grid, signed: NDArray[np.int64], scenarios: list[Scenario]) -> F64:
     """[row] MW of wind and sun less ordinary demand, relative to the mean of the calendar month."""
     ordinary = np.setdiff1d(np.arange(grid.n_load), signed)
     surplus = [
@@ -268,7 +268,7 @@ def usual_surplus(grid: Grid, constants: Constants) -> list[float]:
     return _round([mean[month == k].mean() for k in range(12)], 1)
 
 
-def exchange_level(means: dict[int, float]) -> Floats:
+def exchange_level(means: dict[int, float]) -> F64:
     """[12] usual power of an interconnection: February, April and August are bundled, between them it drifts."""
     winter, spring, summer = means[2], means[4], means[8]
     known = np.array([1.0, 2.0, 4.0, 8.0, 9.0, 12.0, 13.0])
@@ -388,11 +388,11 @@ def survive(engine: NativeEngine, grid: Grid, seed: int, month: int) -> int:
     if grid.opponent.kind != "none":
         draws = draw_opponent(grid, Stream(seed, month, Purpose.OPPONENT), scenario.n_steps)
     engine.begin(0, scenario, 0, scenario.n_steps, outages_of(outages), draws)
-    reset_one(engine.handle.address, 0)
+    reset_one(engine.address, 0)
     nothing = np.zeros(0, np.float32)
     steps = 0
     while not engine.state.terminated[0] and steps < scenario.n_steps:
-        step_one(engine.handle.address, 0, int(ActionKind.NOTHING), 0, 0, nothing)
+        step_one(engine.address, 0, int(ActionKind.NOTHING), 0, 0, nothing)
         steps += not engine.state.terminated[0]
     return steps
 
@@ -494,12 +494,12 @@ def _describe(grid: Grid, constants: Constants, series: list[Any]) -> dict[str, 
     return result
 
 
-def _memory(series: list[Floats]) -> list[float]:
+def _memory(series: list[F64]) -> list[float]:
     """Autocorrelation after one and after six hours."""
     return _round([np.mean([_correlation(values, lag) for values in series]) for lag in (12, 72)], 3)
 
 
-def _correlation(values: Floats, lag: int) -> float:
+def _correlation(values: F64, lag: int) -> float:
     if values[lag:].std() == 0 or values[:-lag].std() == 0:
         return 1.0
     return float(np.corrcoef(values[lag:], values[:-lag])[0, 1])

@@ -24,8 +24,8 @@ os.environ["OPENBLAS_NUM_THREADS"] = "1"
 import lightsim2grid
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
+from rl2grid.arrays import I32
 from rl2grid.engines.native.what_if import WhatIf
 from rl2grid.engines.reference.extract import make_environment
 from rl2grid.grids import Grid, load_grid
@@ -39,7 +39,6 @@ MOST_ACTIONS = 4000
 """Actions of the catalogue that are asked of both sides, drawn evenly; LightSim2Grid gets every tenth of them."""
 _REPEATS = 3
 """How often every question is asked in a round, on either side."""
-I32 = NDArray[np.int32]
 
 
 class LightSim:

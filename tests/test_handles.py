@@ -1,40 +1,48 @@
-"""Handles: compiled code sees the very arrays of a NamedTuple, whatever their dtype and shape."""
+"""Handles: compiled code sees the very arrays of a structure, whatever their dtype and shape."""
 
 import copy
 import pickle
-from collections import namedtuple
-from typing import Any
+from typing import Annotated, Any, NamedTuple
 
 import numba
 import numpy as np
 import pytest
 from numba.core.errors import TypingError
+from numpy.typing import NDArray
 
-from rl2grid.handles import Handle, layout_of, opener
+from rl2grid.arrays import F32, F64, I32, Flags
+from rl2grid.handles import Handle, opener
+from rl2grid.structures import allocate, blank_row, constant, copy_row, episode, row, scratch, workspace
 
 DTYPES = ("bool", "int8", "int32", "int64", "uint16", "uint32", "uint64", "float32", "float64")
-Arrays = namedtuple("Arrays", "flat table block four")
-SHAPES = {"flat": (5,), "table": (3, 4), "block": (2, 3, 4), "four": (2, 1, 3, 2)}
+SIZES = {"a": 5, "b": 3, "c": 4}
 
 
-def arrays_of(dtype: str) -> Any:
-    random = np.random.default_rng(3)
-    return Arrays(**{name: random.integers(0, 100, shape).astype(dtype) for name, shape in SHAPES.items()})
+def block_of(dtype: str) -> Any:
+    """A structure whose arrays are all of one type."""
+    array = NDArray[getattr(np, {"bool": "bool_"}.get(dtype, dtype))]
+    fields = {
+        "flat": Annotated[array, constant("a")],
+        "table": Annotated[array, constant("b c")],
+        "block": Annotated[array, constant("2 b c")],
+        "four": Annotated[array, constant("2 1 3 2")],
+    }
+    return NamedTuple(f"Block_{dtype}", list(fields.items()))
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_every_element_is_read_and_written_in_place(dtype):
-    arrays = arrays_of(dtype)
-    open_arrays = opener(layout_of(arrays))
+    kind = block_of(dtype)
+    open_block = opener(kind)
 
     @numba.njit
     def move(source, target):
         """Copy element by element, by row, and by slice; returns the sizes met."""
-        mine, theirs = open_arrays(source), open_arrays(target)
+        mine, theirs = open_block(source), open_block(target)
         for k in range(mine.flat.shape[0]):
             theirs.flat[k] = mine.flat[k]
-        for row in range(mine.table.shape[0]):
-            theirs.table[row] = mine.table[row]
+        for j in range(mine.table.shape[0]):
+            theirs.table[j] = mine.table[j]
         for i in range(mine.block.shape[0]):
             for j in range(mine.block.shape[1]):
                 for k in range(mine.block.shape[2]):
@@ -43,7 +51,10 @@ def test_every_element_is_read_and_written_in_place(dtype):
         theirs.four[:, 0, 0] = mine.four[:, 0, 0]
         return mine.flat.size, mine.table.shape, mine.block.strides, mine.four.size
 
-    blank = Arrays(*(np.zeros_like(array) for array in arrays))
+    random = np.random.default_rng(3)
+    arrays, blank = allocate(kind, SIZES), allocate(kind, SIZES)
+    for array in arrays:
+        array[:] = random.integers(0, 100, array.shape)
     source, target = Handle(arrays), Handle(blank)
     size, shape, strides, elements = move(source.address, target.address)
     for mine, theirs in zip(blank, arrays, strict=True):
@@ -52,24 +63,32 @@ def test_every_element_is_read_and_written_in_place(dtype):
     assert (size, shape, strides, elements) == (5, (3, 4), arrays.block.strides, 12)
 
 
-Mixed = namedtuple("Mixed", "flags numbers empty")
+class Mixed(NamedTuple):
+    """Fields of different kinds."""
+
+    flags: Annotated[Flags, constant("rows columns")]
+    numbers: Annotated[F64, constant("numbers")]
+    empty: Annotated[F32, constant("2 none")]
 
 
-def mixed_arrays(flags: Any = (2, 3), numbers: Any = 4) -> Any:
-    return Mixed(np.zeros(flags, np.bool_), np.arange(float(numbers)), np.zeros((2, 0), np.float32))
+def mixed_arrays(rows: int = 2, columns: int = 3, numbers: int = 4) -> Mixed:
+    return allocate(
+        Mixed, {"rows": rows, "columns": columns, "none": 0}, numbers=np.arange(float(numbers), dtype=np.float64)
+    )
+
+
+open_mixed = opener(Mixed)
 
 
 def test_fields_of_different_kinds_lie_side_by_side_and_may_be_empty():
-    mixed = mixed_arrays()
-    open_mixed = opener(layout_of(mixed))
-
     @numba.njit
     def touch(address):
-        handle = open_mixed(address)
-        handle.flags[1, 2] = handle.empty.shape == (2, 0)
-        handle.numbers[:] += 0.5
-        return handle.empty.sum()
+        mixed = open_mixed(address)
+        mixed.flags[1, 2] = mixed.empty.shape == (2, 0)
+        mixed.numbers[:] += 0.5
+        return mixed.empty.sum()
 
+    mixed = mixed_arrays()
     handle = Handle(mixed)
     assert touch(handle.address) == 0.0
     assert mixed.flags.tolist() == [[False, False, False], [False, False, True]]
@@ -77,9 +96,6 @@ def test_fields_of_different_kinds_lie_side_by_side_and_may_be_empty():
 
 
 def test_a_handle_serves_functions_written_for_the_named_tuple():
-    mixed = mixed_arrays()
-    open_mixed = opener(layout_of(mixed))
-
     @numba.njit
     def total(arrays, k):
         return arrays.numbers[k:].sum()
@@ -88,28 +104,35 @@ def test_a_handle_serves_functions_written_for_the_named_tuple():
     def through_a_handle(address):
         return total(open_mixed(address), 1)
 
+    mixed = mixed_arrays()
     handle = Handle(mixed)
     assert through_a_handle(handle.address) == total(mixed, 1) == 6.0
 
 
 def test_one_function_serves_arrays_of_any_size():
-    open_mixed = opener(layout_of(mixed_arrays((0, 0), 0)))
-
     @numba.njit
     def count(address):
         return open_mixed(address).numbers.size
 
     for size in (0, 1, 1000):
-        handle = Handle(mixed_arrays((1, 1), size))
+        handle = Handle(mixed_arrays(1, 1, size))
         assert count(handle.address) == size
 
 
-Whole = namedtuple("Whole", "first scale second")
+class Whole(NamedTuple):
+    """Structures in a structure."""
+
+    first: Mixed
+    scale: Annotated[F64, constant("1")]
+    second: Mixed
+
+
+def whole_arrays() -> Whole:
+    return Whole(mixed_arrays(), np.array([10.0]), mixed_arrays())
 
 
 def test_a_structure_may_hold_structures():
-    whole = Whole(mixed_arrays(), np.array([10.0]), mixed_arrays())
-    open_whole = opener(layout_of(whole))
+    open_whole = opener(Whole)
 
     @numba.njit
     def add(mixed, amount):
@@ -121,6 +144,7 @@ def test_a_structure_may_hold_structures():
         add(whole.second, whole.scale[0])
         whole.first.flags[1, 0] = True
 
+    whole = whole_arrays()
     handle = Handle(whole)
     work(handle.address)
     assert whole.first.numbers.tolist() == [0.0, 1.0, 2.0, 3.0]
@@ -135,13 +159,13 @@ def test_a_structure_may_hold_structures():
 
 @pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda handle: pickle.loads(pickle.dumps(handle))])
 def test_a_copy_of_a_handle_points_at_arrays_of_its_own(duplicate):
-    open_whole = opener(layout_of(Whole(mixed_arrays(), np.zeros(1), mixed_arrays())))
+    open_whole = opener(Whole)
 
     @numba.njit
     def work(address):
         open_whole(address).first.numbers[0] = 7.0
 
-    original = Handle(Whole(mixed_arrays(), np.zeros(1), mixed_arrays()))
+    original = Handle(whole_arrays())
     twin = duplicate(original)
     work(twin.address)
     assert twin.structure.first.numbers[0] == 7.0
@@ -156,21 +180,95 @@ def test_a_copy_of_who_holds_structure_and_handle_holds_one_copy_of_the_arrays()
 
 
 @pytest.mark.parametrize(
-    "array", [np.zeros((4, 4))[:, ::2], np.zeros((4, 3)).T, np.zeros(6)[::2], np.asfortranarray(np.zeros((3, 2)))]
+    "array",
+    [
+        np.zeros((4, 4))[:, ::2],
+        np.zeros((4, 3)).T,
+        np.zeros(6)[::2],
+        np.asfortranarray(np.zeros((3, 2))),
+        np.zeros((3, 2)),
+        np.zeros(3, np.float32),
+    ],
 )
-def test_arrays_that_are_not_contiguous_are_refused(array):
-    with pytest.raises(ValueError, match=r"Mixed\.numbers is not contiguous"):
-        Handle(Mixed(np.zeros((1, 1), np.bool_), array, np.zeros((1, 1), np.float32)))
+def test_arrays_that_are_not_as_declared_are_refused(array):
+    with pytest.raises(TypeError, match=r"Mixed\.numbers has to be a contiguous float64 array with 1 axes"):
+        Handle(mixed_arrays()._replace(numbers=array))
 
 
-def test_an_attribute_that_is_no_array_does_not_compile():
-    mixed = mixed_arrays()
-    open_mixed = opener(layout_of(mixed))
-
+def test_an_attribute_that_is_no_field_does_not_compile():
     @numba.njit
     def wrong(address):
         return open_mixed(address).letters
 
-    handle = Handle(mixed)
+    handle = Handle(mixed_arrays())
     with pytest.raises(TypingError, match="letters"):
         wrong(handle.address)
+
+
+class Rows(NamedTuple):
+    """One field for every way in which copying or blanking may go wrong."""
+
+    limit: Annotated[F64, constant("k")]
+    single: Annotated[I32, row("", blank=-3)]
+    table: Annotated[F32, row("k 2", blank=0.5)]
+    flags: Annotated[Flags, row("k", blank=1)]
+    zeros: Annotated[F64, row("2 k", blank=0)]
+    empty: Annotated[F64, row("none", blank=2)]
+    unblanked: Annotated[I32, row("k")]
+    plan: Annotated[I32, episode("k", blank=4)]
+    passing: Annotated[F64, scratch("k")]
+    bench: Annotated[F64, workspace("k")]
+
+
+def rows_of(n: int, seed: int) -> Rows:
+    random = np.random.default_rng(seed)
+    rows = allocate(Rows, {"k": 3, "none": 0}, n)
+    for array in rows:
+        array[:] = random.integers(2, 99, array.shape)
+    return rows
+
+
+open_rows = opener(Rows)
+
+
+def both(source: Rows, i: int, target: Rows, j: int) -> tuple[Rows, Rows]:
+    """The target after the copy, by Python and by compiled code."""
+
+    @numba.njit
+    def compiled(source, i, target, j):
+        copy_row(open_rows(source), i, open_rows(target), j)
+
+    mine, theirs = copy.deepcopy(target), copy.deepcopy(target)
+    copy_row(source, i, mine, j)
+    handles = Handle(source), Handle(theirs)
+    compiled(handles[0].address, i, handles[1].address, j)
+    return mine, theirs
+
+
+def test_a_row_is_copied_but_for_what_is_fixed_shared_or_passing():
+    source, target = rows_of(4, 1), rows_of(3, 2)
+    before = copy.deepcopy(target)
+    mine, theirs = both(source, 3, target, 1)
+    for name in Rows._fields:
+        np.testing.assert_array_equal(getattr(mine, name), getattr(theirs, name), err_msg=name)
+        expected = np.array(getattr(before, name))
+        if name in ("single", "table", "flags", "zeros", "unblanked"):
+            expected[1] = getattr(source, name)[3]
+        np.testing.assert_array_equal(getattr(mine, name), expected, err_msg=name)
+
+
+def test_a_row_is_blanked_as_declared():
+    @numba.njit
+    def compiled(address, i):
+        blank_row(open_rows(address), i)
+
+    mine, theirs = rows_of(3, 5), rows_of(3, 5)
+    blank_row(mine, 1)
+    handle = Handle(theirs)
+    compiled(handle.address, 1)
+    expected = rows_of(3, 5)
+    for name, value in {"single": -3, "table": 0.5, "flags": True, "zeros": 0, "plan": 4}.items():
+        getattr(expected, name)[1] = value
+    for name in Rows._fields:
+        np.testing.assert_array_equal(getattr(mine, name), getattr(expected, name), err_msg=name)
+        np.testing.assert_array_equal(getattr(theirs, name), getattr(expected, name), err_msg=name)

@@ -1,10 +1,10 @@
-"""A NamedTuple of arrays, handed to compiled code as one address.
+"""A structure of arrays, handed to compiled code as one address.
 
 Numba passes a NamedTuple by copying every array of it, at each call from Python and at each call that is not
 inlined. A simulator whose state has hundreds of arrays would spend its time there. A :class:`Handle` writes the
 addresses and shapes of the arrays into one integer array, a table; in compiled code :func:`opener` turns the
 address of the table into a value whose attributes are the arrays, so that functions written for the NamedTuple
-(``state.rho[i, line]``) compile for it unchanged. A field may be such a NamedTuple itself
+(``state.rho[i, line]``) compile for it unchanged. A field may be a structure itself
 (``environments.state.rho[i, line]``): all that an engine works with is then one number, passed on for nothing.
 
 The handle must be kept for as long as its address is used, and the arrays must not be replaced.
@@ -15,71 +15,53 @@ from __future__ import annotations
 import copy
 import hashlib
 from collections.abc import Callable
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, Generic
 
 import numpy as np
 from llvmlite import ir
-from numba.core import types
+from numba.core import cgutils, types
 from numba.core.datamodel import models
-from numba.core.extending import intrinsic, lower_getattr_generic, register_model
+from numba.core.extending import (
+    intrinsic,
+    lower_builtin,
+    lower_getattr_generic,
+    register_model,
+    type_callable,
+)
 from numba.core.imputils import impl_ret_borrowed
 from numba.core.typing.templates import AttributeTemplate, infer_getattr
 from numba.np.arrayobj import make_array, populate_array
 from numba.np.numpy_support import from_dtype
-from numpy.typing import NDArray
 
-Structure = TypeVar("Structure", bound=tuple[Any, ...])
-"""A NamedTuple of arrays and of such NamedTuples."""
+from rl2grid.structures import Role, Structure, blank_row, blanks_of, check, copy_row, declaration_of
 
 _WORD = ir.IntType(64)
-
-
-class Layout(NamedTuple):
-    """What compiled code has to know of a structure; sizes may differ from one to the next."""
-
-    label: str
-    fields: tuple[tuple[str, Layout | str, int], ...]
-    """Name, dtype and number of axes of each array; name, layout and 0 of each structure."""
-
-
-def layout_of(structure: Any) -> Layout:
-    """The layout of a NamedTuple."""
-    fields = zip(structure._fields, structure, strict=True)
-    return Layout(type(structure).__name__, tuple((name, *_kind_of(value)) for name, value in fields))
-
-
-def _kind_of(value: Any) -> tuple[Layout | str, int]:
-    return (layout_of(value), 0) if isinstance(value, tuple) else (value.dtype.str, value.ndim)
 
 
 class Handle(Generic[Structure]):
     """Where compiled code finds a structure. A copy, or one that was pickled, points at arrays of its own.
 
     Raises:
-        ValueError: an array is not C-contiguous, which compiled code takes for granted.
+        TypeError: an array is not what was declared.
     """
 
     def __init__(self, structure: Structure) -> None:
+        check(structure)
         self.structure = structure
-        fields: tuple[str, ...] = structure._fields  # type: ignore[attr-defined]
-        self._parts: dict[str, Handle[Any]] = {}
-        self._slots: dict[str, int] = {}
+        declaration = declaration_of(type(structure))
+        self._parts: dict[str, Handle[Any]] = {name: Handle(getattr(structure, name)) for name in declaration.parts}
         words: list[int] = []
-        for name, value in zip(fields, structure, strict=True):
-            self._slots[name] = len(words)
-            if isinstance(value, tuple):
-                self._parts[name] = Handle(value)
-                words.append(self._parts[name].address)
-            elif value.flags.c_contiguous:
-                words += [value.ctypes.data, *value.shape]
-            else:
-                raise ValueError(f"{type(structure).__name__}.{name} is not contiguous.")
-        self._table: NDArray[np.int64] = np.array(words, np.int64)
+        for name in declaration.fields:
+            array = getattr(structure, name)
+            words += [array.ctypes.data, *array.shape]
+        self._first_part = len(words)
+        words += [part.address for part in self._parts.values()]
+        self._table = np.array(words, np.int64)
         self.address: int = self._table.ctypes.data
 
     def point_at(self, name: str, part: Handle[Any]) -> None:
-        """Let compiled code see another structure of the same layout as ``name``; the caller keeps it."""
-        self._table[self._slots[name]] = part.address
+        """Let compiled code see another structure of the same kind as ``name``; the caller keeps it."""
+        self._table[self._first_part + list(self._parts).index(name)] = part.address
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Handle[Structure]:
         return Handle(copy.deepcopy(self.structure, memo))
@@ -89,23 +71,25 @@ class Handle(Generic[Structure]):
 
 
 class HandleType(types.Type):  # type: ignore[misc]
-    """Type of a handle in compiled code: which attributes it has."""
+    """Type of a handle in compiled code: which attributes it has, and where in the table."""
 
-    def __init__(self, layout: Layout) -> None:
-        self.layout = layout
+    def __init__(self, kind: type[tuple[Any, ...]]) -> None:
+        self.kind = kind
         self.attributes: dict[str, Any] = {}
         self.slots: dict[str, int] = {}
+        declaration = declaration_of(kind)
         slot = 0
-        for field, kind, ndim in layout.fields:
-            if isinstance(kind, Layout):
-                self.attributes[field] = HandleType(kind)
-            else:
-                self.attributes[field] = types.Array(from_dtype(np.dtype(kind)), ndim, "C")
-            self.slots[field] = slot
-            slot += 1 + ndim
+        for name, field in declaration.fields.items():
+            self.attributes[name] = types.Array(from_dtype(field.dtype), field.ndim, "C")
+            self.slots[name] = slot
+            slot += 1 + field.ndim
+        for name, part in declaration.parts.items():
+            self.attributes[name] = HandleType(part)
+            self.slots[name] = slot
+            slot += 1
         # The name goes into the symbol of every function that takes the handle: it had better be short.
-        digest = hashlib.sha256(repr(layout).encode()).hexdigest()[:16]
-        super().__init__(name=f"{layout.label}.{digest}")
+        digest = hashlib.sha256(repr((self.attributes, declaration.fields)).encode()).hexdigest()[:16]
+        super().__init__(name=f"{kind.__name__}.{digest}")
 
 
 @register_model(HandleType)
@@ -122,35 +106,34 @@ class _HandleAttributes(AttributeTemplate):  # type: ignore[misc]
         return handle.attributes.get(attribute)
 
 
+def _word(builder: Any, address: Any, slot: int) -> Any:
+    """An entry of a table."""
+    table = builder.inttoptr(address, _WORD.as_pointer())
+    loaded = builder.load(builder.gep(table, [_WORD(slot)]))
+    # Tables never change: the compiler may keep what it has read of them.
+    loaded.set_metadata("invariant.load", builder.module.add_metadata([]))
+    return loaded
+
+
 @lower_getattr_generic(HandleType)  # type: ignore[untyped-decorator]
-def _read_attribute(context: Any, builder: Any, handle: HandleType, value: Any, attribute: str) -> Any:
-    kind = handle.attributes[attribute]
-    table = builder.inttoptr(value, _WORD.as_pointer())
-
-    def word(slot: int) -> Any:
-        address = builder.gep(table, [_WORD(slot)])
-        loaded = builder.load(address)
-        # Tables never change: the compiler may keep what it has read of them.
-        loaded.set_metadata("invariant.load", builder.module.add_metadata([]))
-        return loaded
-
-    slot = handle.slots[attribute]
+def _read_attribute(context: Any, builder: Any, handle: HandleType, address: Any, attribute: str) -> Any:
+    kind, slot = handle.attributes[attribute], handle.slots[attribute]
     if isinstance(kind, HandleType):
-        return word(slot)
-    shape = [word(slot + 1 + axis) for axis in range(kind.ndim)]
+        return _word(builder, address, slot)
+    shape = [_word(builder, address, slot + 1 + axis) for axis in range(kind.ndim)]
     item_size = context.get_abi_sizeof(context.get_data_type(kind.dtype))
     strides = [_WORD(item_size)]
     for extent in reversed(shape[1:]):
         strides.insert(0, builder.mul(strides[0], extent))
     array = make_array(kind)(context, builder)
-    data = builder.inttoptr(word(slot), context.get_data_type(kind.dtype).as_pointer())
+    data = builder.inttoptr(_word(builder, address, slot), context.get_data_type(kind.dtype).as_pointer())
     populate_array(array, data, shape, strides, _WORD(item_size), None)
     return impl_ret_borrowed(context, builder, kind, array._getvalue())
 
 
-def opener(layout: Layout) -> Callable[[int], Any]:
-    """A function for compiled code that turns the address of a handle to such a structure into the structure."""
-    handle = HandleType(layout)
+def opener(kind: type[Structure]) -> Callable[[int], Structure]:
+    """A function for compiled code that turns the address of a handle to a structure into the structure."""
+    handle = HandleType(kind)
 
     @intrinsic  # type: ignore[untyped-decorator]
     def open_handle(typing_context: Any, address: Any) -> Any:
@@ -159,5 +142,71 @@ def opener(layout: Layout) -> Callable[[int], Any]:
 
         return handle(types.int64), generate
 
-    result: Callable[[int], Any] = open_handle
+    result: Callable[[int], Structure] = open_handle
     return result
+
+
+def _row_of_field(
+    context: Any, builder: Any, handle: HandleType, address: Any, name: str, row: Any
+) -> tuple[Any, Any, Any]:
+    """Pointer to the row of a field, and the number and type of its entries."""
+    kind, slot = handle.attributes[name], handle.slots[name]
+    size = _WORD(1)
+    for axis in range(1, kind.ndim):
+        size = builder.mul(size, _word(builder, address, slot + 1 + axis))
+    entry = context.get_data_type(kind.dtype)
+    data = builder.inttoptr(_word(builder, address, slot), entry.as_pointer())
+    return builder.gep(data, [builder.mul(row, size)]), size, entry
+
+
+@type_callable(copy_row)  # type: ignore[untyped-decorator]
+def _type_copy_row(context: Any) -> Any:
+    def typer(source: Any, i: Any, target: Any, j: Any) -> Any:
+        if isinstance(source, HandleType) and source == target:
+            return types.void(source, types.intp, target, types.intp)
+        return None
+
+    return typer
+
+
+@lower_builtin(copy_row, HandleType, types.intp, HandleType, types.intp)  # type: ignore[untyped-decorator]
+def _generate_copy_row(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    handle = signature.args[0]
+    source, i, target, j = arguments
+    for name, field in declaration_of(handle.kind).fields.items():
+        if field.role is Role.KEPT:
+            from_pointer, size, entry = _row_of_field(context, builder, handle, source, name, i)
+            to_pointer, _, _ = _row_of_field(context, builder, handle, target, name, j)
+            if field.axes:
+                cgutils.raw_memmove(builder, to_pointer, from_pointer, size, context.get_abi_sizeof(entry))
+            else:
+                builder.store(builder.load(from_pointer), to_pointer)
+    return context.get_dummy_value()
+
+
+@type_callable(blank_row)  # type: ignore[untyped-decorator]
+def _type_blank_row(context: Any) -> Any:
+    def typer(structure: Any, i: Any) -> Any:
+        return types.void(structure, types.intp) if isinstance(structure, HandleType) else None
+
+    return typer
+
+
+@lower_builtin(blank_row, HandleType, types.intp)  # type: ignore[untyped-decorator]
+def _generate_blank_row(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    handle = signature.args[0]
+    address, i = arguments
+    for name, value in blanks_of(handle.kind).items():
+        _fill_row(context, builder, _row_of_field(context, builder, handle, address, name, i), value)
+    return context.get_dummy_value()
+
+
+def _fill_row(context: Any, builder: Any, row: tuple[Any, Any, Any], value: float) -> None:
+    pointer, size, entry = row
+    if value == 0:
+        n_bytes = builder.mul(size, _WORD(context.get_abi_sizeof(entry)))
+        cgutils.memset(builder, pointer, n_bytes, 0)
+        return
+    number = ir.Constant(entry, int(value) if isinstance(entry, ir.IntType) else float(value))
+    with cgutils.for_range(builder, size) as loop:
+        builder.store(number, builder.gep(pointer, [loop.index]))

@@ -39,7 +39,7 @@ def scenario_of(environment, name):
 
 def begin(engine, scenario):
     engine.begin(0, scenario, 0, scenario.n_steps, NO_OUTAGES, None)
-    reset_one(engine.handle.address, 0)
+    reset_one(engine.address, 0)
 
 
 def play_in_grid2op(environment, grid, action):

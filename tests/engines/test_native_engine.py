@@ -51,7 +51,7 @@ class Trial:
         self.engine = engine_of(grid_id, dispatch)
         self.state, self.grid = self.engine.state, self.engine.grid
         self.engine.begin(0, replace(calm_scenario(grid_id), **series), 0, STEPS - 1, NO_OUTAGES, None)
-        reset_one(self.engine.handle.address, 0)
+        reset_one(self.engine.address, 0)
         self.check()
 
     @property

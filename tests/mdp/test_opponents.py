@@ -17,7 +17,6 @@ from rl2grid.mdp import opponents
 from rl2grid.mdp.opponents import (
     OpponentDraws,
     attack,
-    copy_opponent,
     draw_opponent,
     load_draws,
     new_opponent_state,
@@ -25,6 +24,7 @@ from rl2grid.mdp.opponents import (
 )
 from rl2grid.mdp.state import new_state
 from rl2grid.streams import Purpose, Stream
+from rl2grid.structures import row_of
 
 ATTACKED_GRIDS = ("bus36-MO-v0", "bus36-MO-v1", "bus118-MOB-v0", "bus118-MOB-v1")
 GEOMETRIC_GRIDS = ATTACKED_GRIDS[1:]
@@ -279,7 +279,7 @@ def test_rows_are_independent_and_reload_completely():
         attack(opponent, 2, alone.rho, alone.status)
         assert np.array_equal(opponent.attacked[2], alone.opponent.attacked[0])
     assert not opponent.attacked[:2].any()
-    own = copy_opponent(opponent, 2)
+    own = row_of(opponent, 2)
     attack(opponent, 2, alone.rho, alone.status)
     attack(own, 0, alone.rho, alone.status)
     assert own.budget[0] == opponent.budget[2]
@@ -298,7 +298,7 @@ def test_compiled_and_interpreted_agree(grid_id, monkeypatch):
         state.rho[1] = rng.random(grid.n_line)
         state.line_status[1] = rng.random(grid.n_line) > 0.003
         opponent_step(state, compiled, 1)
-        observations.append((state.rho[1].copy(), state.line_status[1].copy(), copy_opponent(compiled, 1)))
+        observations.append((state.rho[1].copy(), state.line_status[1].copy(), row_of(compiled, 1)))
     assert compiled.attack_counter[1].min() > 1
     for name, function in vars(opponents).copy().items():
         if hasattr(function, "py_func"):
@@ -306,7 +306,7 @@ def test_compiled_and_interpreted_agree(grid_id, monkeypatch):
     for rho, line_status, expected in observations:
         state.rho[1], state.line_status[1] = rho, line_status
         opponents.opponent_step(state, interpreted, 1)
-        for name, array in zip(interpreted._fields, copy_opponent(interpreted, 1), strict=True):
+        for name, array in zip(interpreted._fields, row_of(interpreted, 1), strict=True):
             np.testing.assert_array_equal(array, getattr(expected, name), err_msg=name)
 
 

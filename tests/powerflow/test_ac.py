@@ -18,7 +18,6 @@ from rl2grid.powerflow.ac import (
     DISCONNECTED,
     DIVERGED,
     FlowState,
-    copy_flow,
     forget_flow,
     new_flow_state,
     run_flow,
@@ -27,6 +26,7 @@ from rl2grid.powerflow.ac import (
 )
 from rl2grid.powerflow.model import Network, load_network
 from rl2grid.scenarios.library import list_scenarios, load_scenario
+from rl2grid.structures import copy_row
 
 CURRENT_TOLERANCE = 1e-4  # A; beside it float32 is allowed two units in the last place
 POWER_TOLERANCE = 1e-4  # MW
@@ -419,7 +419,7 @@ def test_a_copied_row_goes_on_like_the_original() -> None:
     rows = series("bus36-M")
     for injections in rows[:5]:
         source.run(topo_vect, injections, 1)
-    copy_flow(source.flow, 1, target.flow, 2)
+    copy_row(source.flow, 1, target.flow, 2)
     np.testing.assert_array_equal(source.voltage(1), target.voltage(2))
     for injections in rows[5:10]:
         assert target.run(topo_vect, injections, 2) is not None
@@ -468,7 +468,7 @@ def test_references_are_neither_lost_nor_kept() -> None:
     def play() -> None:
         for number in range(50):
             rows.run(divided if number % 3 == 0 else topo_vect, injections)
-            copy_flow(rows.flow, 0, rows.flow, 1)
+            copy_row(rows.flow, 0, rows.flow, 1)
             forget_flow(rows.flow, 1)
         narrow = Rows("bus14")
         narrow.flow = narrow.flow._replace(panel=narrow.flow.panel[:, :20].copy())

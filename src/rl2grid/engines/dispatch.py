@@ -16,6 +16,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from rl2grid.arrays import F32, F64, Flags
 from rl2grid.compile import jit
 
 TOLERANCE = np.float32(1e-2)
@@ -28,15 +29,9 @@ NEGLIGIBLE = np.float32(1e-7)
 _SLACK = np.float64(np.float32(0.5) * EPSILON)
 _UNROLLED = 8
 
-Floats = NDArray[np.float32]
-Doubles = NDArray[np.float64]
-Flags = NDArray[np.bool_]
-
 
 @jit
-def redispatch_is_impossible(
-    request: Floats, target: Floats, actual: Floats, modified: Flags, pmin: Floats, pmax: Floats
-) -> bool:
+def redispatch_is_impossible(request: F32, target: F32, actual: F32, modified: Flags, pmin: F32, pmax: F32) -> bool:
     """Whether ``request`` would bring a target out of reach, further than ``pmax - pmin`` from zero.
 
     Grid2Op then forgets the request but keeps the topology of the same action, and gets storage
@@ -63,7 +58,7 @@ def redispatch_is_impossible(
 
 
 @jit
-def add_request(request: Floats, target: Floats, actual: Floats, modified: Flags) -> None:
+def add_request(request: F32, target: F32, actual: F32, modified: Flags) -> None:
     """Add ``request`` to ``target`` in place and mark its generators in ``modified``.
 
     A generator's first request counts from where the generator is, later ones from its target
@@ -80,7 +75,7 @@ def add_request(request: Floats, target: Floats, actual: Floats, modified: Flags
 
 
 @jit
-def dispatch_is_needed(actual: Floats, target: Floats, storage: float, curtailment: float) -> bool:
+def dispatch_is_needed(actual: F32, target: F32, storage: float, curtailment: float) -> bool:
     """Whether anything has to be dispatched in this step (``BaseEnv._make_redisp``).
 
     Args:
@@ -99,18 +94,18 @@ def dispatch_is_needed(actual: Floats, target: Floats, storage: float, curtailme
 
 @jit
 def find_dispatch(
-    new_p: Floats,
-    setpoint: Floats,
-    target: Floats,
-    actual: Floats,
+    new_p: F32,
+    setpoint: F32,
+    target: F32,
+    actual: F32,
     modified: Flags,
-    pmin: Floats,
-    pmax: Floats,
-    ramp_up: Floats,
-    ramp_down: Floats,
+    pmin: F32,
+    pmax: F32,
+    ramp_up: F32,
+    ramp_down: F32,
     redispatchable: Flags,
     power: float,
-    out: Floats,
+    out: F32,
 ) -> bool:
     """Write the best feasible ``actual_dispatch`` to ``out``; False (a game over) if there is none.
 
@@ -166,9 +161,7 @@ def find_dispatch(
 
 
 @jit
-def solve_programme(
-    goal: Doubles, flexibility: Doubles, lower: Doubles, upper: Doubles, costly: int, total: float, out: Doubles
-) -> None:
+def solve_programme(goal: F64, flexibility: F64, lower: F64, upper: F64, costly: int, total: float, out: F64) -> None:
     """The quadratic programme of :func:`find_dispatch` on plain numbers, all float64 of shape [n].
 
     Minimises the sum of ``(x - goal)**2 / flexibility`` over the first ``costly`` entries, subject to
@@ -200,7 +193,7 @@ def solve_programme(
 
 @jit
 def _participants(
-    new_p: Floats, target: Floats, actual: Floats, redispatchable: Flags, every: bool, out: NDArray[np.int64]
+    new_p: F32, target: F32, actual: F32, redispatchable: Flags, every: bool, out: NDArray[np.int64]
 ) -> int:
     """Write the generators that take part in the dispatch to ``out`` and return how many they are."""
     size = 0
@@ -214,13 +207,13 @@ def _participants(
 
 @jit
 def _can_balance(
-    new_p: Floats,
-    setpoint: Floats,
-    actual: Floats,
-    pmin: Floats,
-    pmax: Floats,
-    ramp_up: Floats,
-    ramp_down: Floats,
+    new_p: F32,
+    setpoint: F32,
+    actual: F32,
+    pmin: F32,
+    pmax: F32,
+    ramp_up: F32,
+    ramp_down: F32,
     members: NDArray[np.int64],
     power: float,
 ) -> bool:
@@ -237,7 +230,7 @@ def _can_balance(
 
 
 @jit
-def rounded_sum(values: Floats, size: int) -> np.float32:
+def rounded_sum(values: F32, size: int) -> np.float32:
     """``values[:size].sum()`` with the rounding of NumPy, which adds in eight parallel sums.
 
     NumPy does so up to 128 values, more than any grid here has generators.
@@ -271,7 +264,7 @@ def _costly_first(modified: Flags, members: NDArray[np.int64]) -> int:
 
 
 @jit
-def _share_out(goal: Doubles, flexibility: Doubles, lower: Doubles, upper: Doubles, total: float, out: Doubles) -> None:
+def _share_out(goal: F64, flexibility: F64, lower: F64, upper: F64, total: float, out: F64) -> None:
     """Solve for entries that all have a goal.
 
     The optimum is ``clip(goal + multiplier * flexibility, lower, upper)``, whose sum is piecewise
@@ -308,7 +301,7 @@ def _share_out(goal: Doubles, flexibility: Doubles, lower: Doubles, upper: Doubl
 
 
 @jit
-def _sum_at(goal: Doubles, flexibility: Doubles, lower: Doubles, upper: Doubles, multiplier: float) -> float:
+def _sum_at(goal: F64, flexibility: F64, lower: F64, upper: F64, multiplier: float) -> float:
     """The sum of ``clip(goal + multiplier * flexibility, lower, upper)``."""
     total = 0.0
     for k in range(goal.size):
@@ -317,7 +310,7 @@ def _sum_at(goal: Doubles, flexibility: Doubles, lower: Doubles, upper: Doubles,
 
 
 @jit
-def _sort(values: Doubles) -> None:
+def _sort(values: F64) -> None:
     """Sort in place, by insertion: quickest for so few."""
     for k in range(1, values.size):
         value = values[k]

@@ -6,9 +6,10 @@ from typing import Protocol
 
 import numpy as np
 
+from rl2grid.arrays import F32, Flags
 from rl2grid.grids import Grid
 from rl2grid.mdp.actions import ActionKind, StepAction, decode_continuous
-from rl2grid.mdp.state import F32, Flags, GridState
+from rl2grid.mdp.state import GridState
 
 _TOLERANCE = 0.05
 """MW below which a difference between what was asked and what happened is not worth a word."""

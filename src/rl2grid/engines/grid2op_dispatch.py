@@ -13,7 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rl2grid.engines.dispatch import EPSILON, NEGLIGIBLE, TOLERANCE, Doubles, Flags, Floats
+from rl2grid.arrays import F32, F64, Flags
+from rl2grid.engines.dispatch import EPSILON, NEGLIGIBLE, TOLERANCE
 
 _LEAST_PRECISION = 1e-6
 _LEAST_SUM_OF_WEIGHTS = 1e-2
@@ -23,31 +24,31 @@ _SLACK = 0.5 * EPSILON
 class _Programme(NamedTuple):
     """The quadratic programme over the participating generators, scaled; see :func:`find_dispatch_grid2op`."""
 
-    goal: Doubles  # [costly]
+    goal: F64  # [costly]
     costly: Flags  # [participant]
-    weight: Doubles  # [participant]
-    lower: Doubles  # [participant]
-    upper: Doubles  # [participant]
+    weight: F64  # [participant]
+    lower: F64  # [participant]
+    upper: F64  # [participant]
     total: float
-    start: Doubles  # [participant]
+    start: F64  # [participant]
     scale: float
     """MW per unit of the other values."""
     scale_objective: float
 
 
 def find_dispatch_grid2op(
-    new_p: Floats,
-    setpoint: Floats,
-    target: Floats,
-    actual: Floats,
+    new_p: F32,
+    setpoint: F32,
+    target: F32,
+    actual: F32,
     modified: Flags,
-    pmin: Floats,
-    pmax: Floats,
-    ramp_up: Floats,
-    ramp_down: Floats,
+    pmin: F32,
+    pmax: F32,
+    ramp_up: F32,
+    ramp_down: F32,
     redispatchable: Flags,
     power: float,
-    out: Floats,
+    out: F32,
 ) -> bool:
     """Write Grid2Op's new ``actual_dispatch`` to ``out``; False (a game over) if it finds none.
 
@@ -76,12 +77,12 @@ def find_dispatch_grid2op(
 
 
 def _can_balance(
-    rise: Floats,
-    setpoint: Floats,
-    pmin: Floats,
-    pmax: Floats,
-    ramp_up: Floats,
-    ramp_down: Floats,
+    rise: F32,
+    setpoint: F32,
+    pmin: F32,
+    pmax: F32,
+    ramp_up: F32,
+    ramp_down: F32,
     members: Flags,
     power: float,
 ) -> bool:
@@ -94,13 +95,13 @@ def _can_balance(
 
 
 def _scale(
-    target: Floats,
-    actual: Floats,
+    target: F32,
+    actual: F32,
     modified: Flags,
     members: Flags,
-    flexibility: Floats,
-    lower: Doubles,
-    upper: Doubles,
+    flexibility: F32,
+    lower: F64,
+    upper: F64,
     power: float,
 ) -> _Programme:
     """The programme in units that suit the solver, with its starting point."""
@@ -121,7 +122,7 @@ def _scale(
     return _Programme(goal, costly, weight, lower / scale, upper / scale, power / scale, start, scale, scale_objective)
 
 
-def _balanced_start(start: Doubles, weight: Doubles) -> Doubles:
+def _balanced_start(start: F64, weight: F64) -> F64:
     """``start`` in float64 with its zeros replaced, in proportion to the ramps, so that it sums to zero."""
     start = start.astype(np.float64)
     free = np.abs(start) <= 1e-7
@@ -135,7 +136,7 @@ def _balanced_start(start: Doubles, weight: Doubles) -> Doubles:
     return start
 
 
-def _solve(programme: _Programme) -> Doubles | None:
+def _solve(programme: _Programme) -> F64 | None:
     """What the solver returns if it converged or respects the constraints nearly; else None."""
     from scipy.optimize import minimize  # slow to import and not needed by the exact dispatch
 
@@ -144,10 +145,10 @@ def _solve(programme: _Programme) -> Doubles | None:
     costly_weight = programme.weight[costly]
     sums, signs = np.ones((1, size)), np.concatenate((np.eye(size), -np.eye(size)))
 
-    def objective(x: Doubles) -> float:
+    def objective(x: F64) -> float:
         return float((costly_weight * (x[costly] - goal) ** 2).sum() / programme.scale_objective)
 
-    def gradient(x: Doubles) -> Doubles:
+    def gradient(x: F64) -> F64:
         slope = np.zeros(size)
         slope[costly] = 2.0 * costly_weight * (x[costly] - goal)
         return slope / programme.scale_objective
@@ -164,7 +165,7 @@ def _solve(programme: _Programme) -> Doubles | None:
         ],
         options={"ftol": precision},
     )
-    change: Doubles = found.x
+    change: F64 = found.x
     if found.success:
         return change
     values = np.append(np.matmul(sums, change), change)

@@ -14,8 +14,8 @@ from importlib import resources
 from typing import Any, get_type_hints
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rl2grid.arrays import F32, I32, Flags
 from rl2grid.errors import one_of
 
 GRID_IDS: tuple[str, ...] = (
@@ -32,10 +32,7 @@ GRID_IDS: tuple[str, ...] = (
 STEPS_PER_HOUR = 12
 """All grids play 5-minute steps."""
 
-Ints = NDArray[np.int32]
-Floats = NDArray[np.float32]
-Bools = NDArray[np.bool_]
-_DTYPES: dict[Any, type] = {Ints: np.int32, Floats: np.float32, Bools: np.bool_}
+_DTYPES: dict[Any, type] = {I32: np.int32, F32: np.float32, Flags: np.bool_}
 
 
 @dataclass(frozen=True)
@@ -129,44 +126,44 @@ class Grid:
     name_storage: tuple[str, ...]
     layout: tuple[tuple[float, float], ...]
     """Position of each substation on a drawing."""
-    sub_area: Ints
+    sub_area: I32
     """Area of each substation (``RulesByArea``); all zero elsewhere."""
-    sub_info: Ints
+    sub_info: I32
     """Number of elements connected to each substation."""
 
-    line_or_to_subid: Ints
-    line_ex_to_subid: Ints
-    gen_to_subid: Ints
-    load_to_subid: Ints
-    storage_to_subid: Ints
-    line_or_pos_topo_vect: Ints
-    line_ex_pos_topo_vect: Ints
-    gen_pos_topo_vect: Ints
-    load_pos_topo_vect: Ints
-    storage_pos_topo_vect: Ints
+    line_or_to_subid: I32
+    line_ex_to_subid: I32
+    gen_to_subid: I32
+    load_to_subid: I32
+    storage_to_subid: I32
+    line_or_pos_topo_vect: I32
+    line_ex_pos_topo_vect: I32
+    gen_pos_topo_vect: I32
+    load_pos_topo_vect: I32
+    storage_pos_topo_vect: I32
 
-    thermal_limit: Floats
+    thermal_limit: F32
     """Permanent current limit at the origin of each line, A."""
     gen_type: tuple[str, ...]
-    gen_pmin: Floats
-    gen_pmax: Floats
-    gen_max_ramp_up: Floats
+    gen_pmin: F32
+    gen_pmax: F32
+    gen_max_ramp_up: F32
     """MW per step."""
-    gen_max_ramp_down: Floats
-    gen_redispatchable: Bools
-    gen_renewable: Bools
-    gen_cost_per_mw: Floats
+    gen_max_ramp_down: F32
+    gen_redispatchable: Flags
+    gen_renewable: Flags
+    gen_cost_per_mw: F32
     """Cost per MWh."""
     slack_gen: int
     """The generator that balances the power flow."""
-    storage_emax: Floats
-    storage_emin: Floats
-    storage_max_p_prod: Floats
-    storage_max_p_absorb: Floats
-    storage_charging_efficiency: Floats
-    storage_discharging_efficiency: Floats
-    storage_loss: Floats
-    load_p_max: Floats
+    storage_emax: F32
+    storage_emin: F32
+    storage_max_p_prod: F32
+    storage_max_p_absorb: F32
+    storage_charging_efficiency: F32
+    storage_discharging_efficiency: F32
+    storage_loss: F32
+    load_p_max: F32
     """Largest demand of each load in the bundled series, MW (used to scale observations)."""
 
     @property
@@ -194,12 +191,12 @@ class Grid:
         return int(self.sub_info.sum())
 
     @functools.cached_property
-    def sub_first_element(self) -> Ints:
+    def sub_first_element(self) -> I32:
         """Position in the topology vector of the first element of each substation."""
         return np.concatenate(([0], np.cumsum(self.sub_info)[:-1])).astype(np.int32)
 
     @functools.cached_property
-    def element_to_subid(self) -> Ints:
+    def element_to_subid(self) -> I32:
         """Substation of each entry of the topology vector."""
         return np.repeat(np.arange(self.n_sub, dtype=np.int32), self.sub_info)
 

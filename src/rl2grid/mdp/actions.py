@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rl2grid.arrays import F32, Flags
 from rl2grid.compile import jit
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
@@ -28,8 +29,6 @@ from rl2grid.mdp.state import GridState
 Kinds = NDArray[np.int8]
 Ids = NDArray[np.int32]
 Masks = NDArray[np.uint32]
-Flags = NDArray[np.bool_]
-Floats = NDArray[np.float32]
 
 
 class ActionKind(enum.IntEnum):
@@ -59,7 +58,7 @@ class StepAction(NamedTuple):
     """Line (SWITCH, RECONNECT) or substation (MOVE, RESTORE)."""
     mask: int = 0
     """MOVE: bit k is the k-th element of the substation, entry ``sub_first_element + k`` of ``topo_vect``."""
-    values: Floats | None = None
+    values: F32 | None = None
     """INJECTION: the Box action, float32 [continuous]; see :func:`decode_continuous`."""
 
 
@@ -216,11 +215,11 @@ def continuous_layout(grid: Grid) -> ContinuousLayout:
 class Injection(NamedTuple):
     """A continuous action in physical units, float32."""
 
-    redispatch: Floats
+    redispatch: F32
     """[gen] MW added to the target dispatch."""
-    curtailment_limit: Floats
+    curtailment_limit: F32
     """[gen] share of pmax that a renewable may produce from now on; -1 on other generators."""
-    storage: Floats
+    storage: F32
     """[storage] MW, positive charges."""
 
 
@@ -250,7 +249,7 @@ def decode_continuous(grid: Grid, action: ArrayLike) -> Injection:
     return Injection(redispatch, limit, storage.astype(np.float32))
 
 
-def validate_continuous(grid: Grid, action: ArrayLike) -> Floats:
+def validate_continuous(grid: Grid, action: ArrayLike) -> F32:
     """``action`` as float32 [continuous].
 
     Raises:
@@ -318,7 +317,7 @@ def _listed(words: list[str]) -> str:
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
 
 
-def _injection_in_words(grid: Grid, values: Floats) -> str:
+def _injection_in_words(grid: Grid, values: F32) -> str:
     injection = decode_continuous(grid, values)
     parts = [
         *(f"redispatch {grid.name_gen[gen]} by {injection.redispatch[gen]:+.1f} MW"

@@ -44,10 +44,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rl2grid.arrays import F32
 from rl2grid.compile import jit
 from rl2grid.errors import one_of
 from rl2grid.grids import STEPS_PER_HOUR, Grid
-from rl2grid.mdp.state import F32, GridState
+from rl2grid.mdp.state import GridState
 
 KINDS: tuple[str, ...] = ("T", "R")
 """Topology tasks and redispatching tasks."""

@@ -40,17 +40,19 @@ Two things differ on purpose:
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rl2grid.arrays import F32, F64, I32, Flags
 from rl2grid.compile import jit
 from rl2grid.errors import UsageError, one_of
 from rl2grid.grids import Grid, OpponentConfig
-from rl2grid.mdp.state import F32, F64, I32, Flags, GridState
+from rl2grid.grids.axes import axis_sizes
+from rl2grid.mdp.state import GridState
 from rl2grid.scenarios.episodes import MAX_STEPS
 from rl2grid.streams import Stream
+from rl2grid.structures import allocate, blank_row, constant, episode, row, scratch
 
 KINDS = ("none", "weighted", "geometric", "multi_area")
 """The kinds of opponent; the position is the code in :attr:`OpponentState.kind`."""
@@ -65,41 +67,42 @@ _UNSET = -(2**31)
 class OpponentState(NamedTuple):
     """Structure of arrays: the opponents of ``n`` environments of one grid.
 
-    Attribute names are Grid2Op's where it has the attribute; shapes are given in brackets. An
-    opponent that is not ``multi_area`` has one area, ``none`` has no area. Durations are in steps.
+    Attribute names are Grid2Op's where it has the attribute. An opponent that is not ``multi_area`` has one area,
+    ``none`` has no area. What is blank before an episode begins with it.
     """
 
-    # Constants, no environment axis.
-    kind: I32  # [1] position in KINDS
-    lines: I32  # [area, slot] attackable lines, padded with -1
-    n_lines: I32  # [area]
-    rho_normalization: F64  # [area, slot] usual loading; 1 unless weighted
-    log_ratio: F64  # [1] logarithm of pmax_pmin_ratio
-    max_duration: I32  # [1]
-    cooldown: I32  # [1]
-    initial_budget: F32  # [1] line-steps
-    budget_per_step: F32  # [1] line-steps
+    kind: Annotated[I32, constant("1", "position in KINDS")]
+    lines: Annotated[I32, constant("area slot", "attackable lines, padded with -1")]
+    n_lines: Annotated[I32, constant("area", "number of attackable lines")]
+    rho_normalization: Annotated[F64, constant("area slot", "usual loading; 1 unless weighted")]
+    log_ratio: Annotated[F64, constant("1", "logarithm of pmax_pmin_ratio")]
+    max_duration: Annotated[I32, constant("1", "longest attack", "steps")]
+    cooldown: Annotated[I32, constant("1", "between attacks", "steps")]
+    initial_budget: Annotated[F32, constant("1", "at the begin of an episode", "line-steps")]
+    budget_per_step: Annotated[F32, constant("1", "earned", "line-steps")]
 
     # Draws of the episode.
-    n_attacks: I32  # [n, area] attacks drawn
-    waits: I32  # [n, area, attack] steps before an attack
-    durations: I32  # [n, area, attack]
-    choices: F64  # [n, area, attack] in [0, 1): which line
+    n_attacks: Annotated[I32, episode("area", "attacks drawn", blank=0)]
+    waits: Annotated[I32, episode("area attack", "before an attack", "steps")]
+    durations: Annotated[I32, episode("area attack", "of an attack", "steps")]
+    choices: Annotated[F64, episode("area attack", "in [0, 1): which line")]
 
     # What changes from step to step.
-    budget: F64  # [n] line-steps
-    budget_is_single: Flags  # [n] the budget still has single precision
-    previous_fails: Flags  # [n] the last attack was refused
-    attack_duration: I32  # [n] current_attack_duration
-    attack_cooldown: I32  # [n] current_attack_cooldown
-    next_attack_time: I32  # [n, area]
-    attack_counter: I32  # [n, area] attacks launched, burnt ones included
-    area_duration: I32  # [n, area] multi_area only: _new_attack_time_counters
-    area_line: I32  # [n, area] line last chosen, -1 if none
+    budget: Annotated[F64, row("", "left", "line-steps")]
+    budget_is_single: Annotated[Flags, row("", "the budget still has single precision", blank=1)]
+    previous_fails: Annotated[Flags, row("", "the last attack was refused", blank=0)]
+    attack_duration: Annotated[I32, row("", "left", "steps", grid2op="current_attack_duration", blank=0)]
+    attack_cooldown: Annotated[I32, row("", "left", "steps", grid2op="current_attack_cooldown")]
+    next_attack_time: Annotated[I32, row("area", "to the next attack", "steps", blank=_UNSET)]
+    attack_counter: Annotated[I32, row("area", "attacks launched, burnt ones included", blank=0)]
+    area_duration: Annotated[
+        I32, row("area", "left, multi_area only", "steps", grid2op="_new_attack_time_counters", blank=-1)
+    ]
+    area_line: Annotated[I32, row("area", "line last chosen, -1 if none", blank=-1)]
 
     # Output of a step.
-    attacked: Flags  # [n, line] opened by the opponent in this step
-    cooldown_written: I32  # [n, line] the line's cooldown becomes at least this
+    attacked: Annotated[Flags, scratch("line", "opened by the opponent in this step", blank=0)]
+    cooldown_written: Annotated[I32, scratch("line", "the cooldown becomes at least this", "steps", blank=0)]
 
 
 class OpponentDraws(NamedTuple):
@@ -138,7 +141,10 @@ def new_opponent_state(grid: Grid, n: int, longest_episode: int = MAX_STEPS) -> 
         lines[area, : len(members)] = members
     if config.rho_normalization:
         normalization[0] = config.rho_normalization
-    opponent = OpponentState(
+    opponent = allocate(
+        OpponentState,
+        axis_sizes(grid) | {"area": n_areas, "attack": capacity},
+        n,
         kind=np.array([KINDS.index(config.kind)], np.int32),
         lines=lines,
         n_lines=np.array([len(area) for area in config.areas], np.int32),
@@ -148,21 +154,6 @@ def new_opponent_state(grid: Grid, n: int, longest_episode: int = MAX_STEPS) -> 
         cooldown=np.array([config.cooldown], np.int32),
         initial_budget=np.array([config.initial_budget], np.float32),
         budget_per_step=np.array([config.budget_per_step], np.float32),
-        n_attacks=np.zeros((n, n_areas), np.int32),
-        waits=np.zeros((n, n_areas, capacity), np.int32),
-        durations=np.zeros((n, n_areas, capacity), np.int32),
-        choices=np.zeros((n, n_areas, capacity), np.float64),
-        budget=np.zeros(n, np.float64),
-        budget_is_single=np.zeros(n, np.bool_),
-        previous_fails=np.zeros(n, np.bool_),
-        attack_duration=np.zeros(n, np.int32),
-        attack_cooldown=np.zeros(n, np.int32),
-        next_attack_time=np.zeros((n, n_areas), np.int32),
-        attack_counter=np.zeros((n, n_areas), np.int32),
-        area_duration=np.zeros((n, n_areas), np.int32),
-        area_line=np.zeros((n, n_areas), np.int32),
-        attacked=np.zeros((n, grid.n_line), np.bool_),
-        cooldown_written=np.zeros((n, grid.n_line), np.int32),
     )
     for i in range(n):
         _begin_episode(opponent, i)
@@ -210,12 +201,6 @@ def load_draws(opponent: OpponentState, i: int, draws: OpponentDraws) -> None:
         getattr(opponent, name)[i, :, :most] = getattr(draws, name)[:, :most]
 
 
-def copy_opponent(opponent: OpponentState, i: int) -> OpponentState:
-    """A state of its own for one environment, equal to ``opponent`` in environment ``i``."""
-    first = OpponentState._fields.index("n_attacks")
-    return opponent._replace(**{name: getattr(opponent, name)[i : i + 1].copy() for name in opponent._fields[first:]})
-
-
 @jit
 def opponent_step(state: GridState, opponent: OpponentState, i: int) -> None:
     """The opponent's part in a step of environment ``i``.
@@ -254,18 +239,9 @@ def attack(opponent: OpponentState, i: int, rho: F32, line_status: Flags) -> Non
 
 
 def _begin_episode(opponent: OpponentState, i: int) -> None:
-    opponent.n_attacks[i] = 0
+    blank_row(opponent, i)
     opponent.budget[i] = opponent.initial_budget[0]
-    opponent.budget_is_single[i] = True
-    opponent.previous_fails[i] = False
-    opponent.attack_duration[i] = 0
     opponent.attack_cooldown[i] = opponent.cooldown[0]
-    opponent.next_attack_time[i] = _UNSET
-    opponent.attack_counter[i] = 0
-    opponent.area_duration[i] = -1
-    opponent.area_line[i] = -1
-    opponent.attacked[i] = False
-    opponent.cooldown_written[i] = 0
 
 
 def _most_attacks(config: OpponentConfig, n_steps: int) -> int:
@@ -274,7 +250,7 @@ def _most_attacks(config: OpponentConfig, n_steps: int) -> int:
     return n_steps // max(shortest, 1) + 1
 
 
-def _geometric(uniforms: NDArray[np.float64], chance: float) -> I32:
+def _geometric(uniforms: F64, chance: float) -> I32:
     """Steps until an event of probability ``chance`` per step, by inversion of the distribution.
 
     The smallest k >= 1 with 1 - (1 - chance)^k > u. Uniforms lie in [0, 1), so "floor + 1" is exact

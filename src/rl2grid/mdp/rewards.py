@@ -50,9 +50,10 @@ from typing import Any
 import numba
 import numpy as np
 
+from rl2grid.arrays import F32, Flags
 from rl2grid.compile import jit
 from rl2grid.errors import UsageError
-from rl2grid.mdp.state import F32, Flags, GridState
+from rl2grid.mdp.state import GridState
 
 Components = tuple[float, float, float]
 """survive, overload, cost."""

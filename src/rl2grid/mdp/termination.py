@@ -9,8 +9,9 @@ import enum
 
 import numpy as np
 
+from rl2grid.arrays import I32
 from rl2grid.compile import jit
-from rl2grid.mdp.state import I32, GridState
+from rl2grid.mdp.state import GridState
 
 
 class GameOver(enum.IntEnum):

@@ -5,21 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rl2grid.powerflow.borrowing import borrowing_jit, owning_jit
-from rl2grid.powerflow.flow_state import (
-    ABSENT,
-    F64,
-    U16,
-    Equations,
-    Factors,
-    FlowState,
-    Index,
-    copy_flow,
-    forget_flow,
-    new_flow_state,
-)
+from rl2grid.arrays import F32, F64, I32, U16, Index
+from rl2grid.compile import borrowing_jit, owning_jit
+from rl2grid.powerflow.flow_state import ABSENT, Equations, Factors, FlowState, forget_flow, new_flow_state
 from rl2grid.powerflow.model import Network
 from rl2grid.powerflow.newton import solve_cold, solve_warm
 from rl2grid.powerflow.topology import build_nodes, is_same_topology, measure_pattern, remember_topology, write_pattern
@@ -29,16 +18,12 @@ __all__ = [
     "DISCONNECTED",
     "DIVERGED",
     "FlowState",
-    "copy_flow",
     "forget_flow",
     "new_flow_state",
     "run_flow",
     "write_currents",
     "write_flow",
 ]
-
-F32 = NDArray[np.float32]
-I32 = NDArray[np.int32]
 
 CONVERGED = 0
 """Status of a flow that was solved."""
@@ -124,7 +109,7 @@ def _solve(network: Network, flow: FlowState, i: int, gen_v: F32 | F64, column: 
         flow.voltage[i],
         flow.injection[i],
         flow.power[i],
-        flow.step[i],
+        flow.step,
     )
     factors = Factors(
         n_free,
@@ -136,7 +121,7 @@ def _solve(network: Network, flow: FlowState, i: int, gen_v: F32 | F64, column: 
         flow.own_panel[i],
         column,
         panel,
-        flow.sparse_row[i],
+        flow.sparse_row,
     )
     if flow.warm[i] and solve_warm(network, flow, i, gen_v, equations, factors):
         return True
@@ -193,7 +178,7 @@ def _slack_is_finite(flow: FlowState, i: int) -> bool:
 @borrowing_jit
 def _has_conflicting_setpoints(flow: FlowState, i: int, gen_v: F32 | F64) -> bool:
     """Whether generators on one bus want different voltages, which LightSim2Grid refuses to solve."""
-    gen_node, setpoint = flow.gen_node[i], flow.step[i]
+    gen_node, setpoint = flow.gen_node[i], flow.step
     for gen in range(gen_node.shape[0]):
         setpoint[gen_node[gen]] = gen_v[gen]
     conflict = False

@@ -8,13 +8,15 @@ the base case, is asked of the cold recipe of :func:`rl2grid.powerflow.ac.run_fl
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rl2grid.grids import Grid, load_grid
-from rl2grid.handles import Handle, layout_of, opener
+from rl2grid.arrays import F32, I8, I32, U32, Flags, Index
+from rl2grid.compile import borrowing_jit
+from rl2grid.grids import Grid
+from rl2grid.grids.axes import axis_sizes
+from rl2grid.handles import Handle, opener
 from rl2grid.powerflow.ac import (
     CONVERGED,
     DISCONNECTED,
@@ -24,9 +26,8 @@ from rl2grid.powerflow.ac import (
     run_flow,
     write_currents,
 )
-from rl2grid.powerflow.borrowing import borrowing_jit
 from rl2grid.powerflow.factors import factorise
-from rl2grid.powerflow.flow_state import ABSENT, F32, I32, Equations, Factors, Index
+from rl2grid.powerflow.flow_state import ABSENT, Equations, Factors
 from rl2grid.powerflow.lane_flow import (
     DONE,
     EMPTY,
@@ -60,13 +61,10 @@ from rl2grid.powerflow.lane_moves import (
 )
 from rl2grid.powerflow.lane_switches import Switches, is_bridge, new_switches, place_switch, solve_switches
 from rl2grid.powerflow.lanes import WIDTH
-from rl2grid.powerflow.model import Network, load_network
+from rl2grid.powerflow.model import Network
 from rl2grid.powerflow.newton import fill_jacobian
 from rl2grid.powerflow.paths import Paths, new_paths, write_path
-
-I8 = NDArray[np.int8]
-U32 = NDArray[np.uint32]
-Flags = NDArray[np.bool_]
+from rl2grid.structures import allocate, constant, workspace
 
 NOTHING, MOVE, SWITCH = range(3)
 """Kinds of changes: none; masked elements of a substation to the other busbar; a line opened, or closed."""
@@ -80,44 +78,44 @@ _ALONE: Any = np.int64(1)
 
 
 class Snapshot(NamedTuple):
-    """An operating point: everything on which the flows after any change depend; shapes in brackets."""
+    """An operating point: everything on which the flows after any change depend."""
 
-    topo_vect: I32  # [topo] busbar of each element, -1 when disconnected
-    last_bus: I32  # [topo] busbar each element is on or was on last, where a line end returns to
-    cooldown_line: I32  # [line] steps before the line may be switched
-    cooldown_sub: I32  # [sub] steps before the substation may be changed
-    gen_p: F32  # [gen] MW
-    gen_v: F32  # [gen] voltage set-point, per unit of the nominal voltage
-    load_p: F32  # [load] MW
-    load_q: F32  # [load] MVAr
-    storage_p: F32  # [storage] MW, positive charges
+    topo_vect: Annotated[I32, constant("topo", "busbar of each element, -1 when disconnected")]
+    last_bus: Annotated[I32, constant("topo", "busbar it is on or was on last, where a line end returns to")]
+    cooldown_line: Annotated[I32, constant("line", "before the line may be switched", "steps")]
+    cooldown_sub: Annotated[I32, constant("sub", "before the substation may be changed", "steps")]
+    gen_p: Annotated[F32, constant("gen", "production", "MW")]
+    gen_v: Annotated[F32, constant("gen", "voltage set-point", "per unit of the nominal voltage")]
+    load_p: Annotated[F32, constant("load", "demand", "MW")]
+    load_q: Annotated[F32, constant("load", "reactive demand", "MVAr")]
+    storage_p: Annotated[F32, constant("storage", "positive charges", "MW")]
 
 
 class Changes(NamedTuple):
     """What is asked; entry by entry."""
 
-    kind: I8  # [change] NOTHING, MOVE or SWITCH
-    target: I32  # [change] substation or line
-    mask: U32  # [change] MOVE: bit k is the k-th element of the substation
+    kind: Annotated[I8, constant("change", "NOTHING, MOVE or SWITCH")]
+    target: Annotated[I32, constant("change", "substation or line")]
+    mask: Annotated[U32, constant("change", "MOVE: bit k is the k-th element of the substation")]
 
 
 class ChangeOutcomes(NamedTuple):
     """The flow after each change; entry by entry."""
 
-    worst_loading: F32  # [change] largest current over thermal limit; inf where there is no flow
-    verdict: I8  # [change] SOLVED, or why there is no flow
-    overloads: I32  # [change] lines above their thermal limit
-    cold: Flags  # [change] the cold recipe was asked
-    rho: F32  # [change, line] loadings, inf where there is no flow; or [0, line]: not wanted
+    worst_loading: Annotated[F32, workspace("change", "largest current over thermal limit; inf where there is no flow")]
+    verdict: Annotated[I8, workspace("change", "SOLVED, or why there is no flow")]
+    overloads: Annotated[I32, workspace("change", "lines above their thermal limit")]
+    cold: Annotated[Flags, workspace("change", "the cold recipe was asked")]
+    rho: Annotated[F32, workspace("wanted line", "by change: loadings, inf where there is no flow; or none")]
 
 
 class Scratch(NamedTuple):
     """Workspace of flows that are solved alone."""
 
-    topo_vect: I32  # [topo]
-    current: F32  # [line] A
-    parent: I32  # [bus]
-    fed: I32  # [bus] 1 where a closed line ends
+    topo_vect: Annotated[I32, workspace("topo")]
+    current: Annotated[F32, workspace("line", "at the origin", "A")]
+    parent: Annotated[I32, workspace("bus", "of a search")]
+    fed: Annotated[I32, workspace("bus", "1 where a closed line ends")]
 
 
 class Batch(NamedTuple):
@@ -164,23 +162,13 @@ class BatchSolver:
 
 def new_snapshot(grid: Grid) -> Snapshot:
     """A blank operating point."""
-
-    def ints(n: int) -> I32:
-        return np.zeros(n, np.int32)
-
-    def floats(n: int) -> F32:
-        return np.zeros(n, np.float32)
-
-    return Snapshot(
-        ints(grid.dim_topo), ints(grid.dim_topo), ints(grid.n_line), ints(grid.n_sub), floats(grid.n_gen),
-        floats(grid.n_gen), floats(grid.n_load), floats(grid.n_load), floats(grid.n_storage),
-    )  # fmt: skip
+    return allocate(Snapshot, axis_sizes(grid))
 
 
 def _new_batch(grid: Grid, network: Network, wiring: Wiring, snapshot: Snapshot) -> Batch:
     """A batch without changes."""
-    n_bus = 2 * grid.n_sub
-    ints = np.int32
+    sizes = axis_sizes(grid)
+    n_bus = sizes["bus"]
     return Batch(
         network,
         wiring,
@@ -189,22 +177,16 @@ def _new_batch(grid: Grid, network: Network, wiring: Wiring, snapshot: Snapshot)
         new_lane_flow(n_bus, grid.n_line),
         new_site(n_bus, int(grid.sub_info.max())),
         new_switches(n_bus),
-        Scratch(
-            np.zeros(grid.dim_topo, ints),
-            np.zeros(grid.n_line, np.float32),
-            np.zeros(n_bus, ints),
-            np.zeros(n_bus, ints),
-        ),
+        allocate(Scratch, sizes),
         snapshot,
-        Changes(np.zeros(0, np.int8), np.zeros(0, np.int32), np.zeros(0, np.uint32)),
+        allocate(Changes, {"change": 0}),
         new_outcomes(0, np.zeros((0, 0), np.float32)),
     )
 
 
 def new_outcomes(n: int, rho: F32) -> ChangeOutcomes:
     """Room for the outcomes of ``n`` changes; ``rho``, float32 [n, line] or [0, line], is written where it lies."""
-    worst_loading, verdict, overloads = np.empty(n, np.float32), np.empty(n, np.int8), np.empty(n, np.int32)
-    return ChangeOutcomes(worst_loading, verdict, overloads, np.empty(n, np.bool_), rho)
+    return allocate(ChangeOutcomes, {"change": n}, rho=rho)
 
 
 def new_wiring(grid: Grid, network: Network) -> Wiring:
@@ -229,10 +211,7 @@ def new_wiring(grid: Grid, network: Network) -> Wiring:
     )
 
 
-_GRID = load_grid("bus14")
-_NETWORK = load_network(_GRID)
-_open_batch = opener(layout_of(_new_batch(_GRID, _NETWORK, new_wiring(_GRID, _NETWORK), new_snapshot(_GRID))))
-"""Layouts are the same for every grid: names, dtypes and axes."""
+_open_batch = opener(Batch)
 
 
 @borrowing_jit
@@ -268,7 +247,7 @@ def solve_changes(address: int, order: I32) -> None:
         flow.voltage[_BASE],
         flow.injection[_BASE],
         flow.power[_BASE],
-        flow.step[_BASE],
+        flow.step,
     )
     factors = Factors(
         n_free,
@@ -280,7 +259,7 @@ def solve_changes(address: int, order: I32) -> None:
         flow.own_panel[_BASE],
         flow.column[_BASE],
         flow.panel[_BASE],
-        flow.sparse_row[_BASE],
+        flow.sparse_row,
     )
     begin = 0
     n = order.shape[0]

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from rl2grid.powerflow.borrowing import borrowing_jit
-from rl2grid.powerflow.flow_state import F64, U16, Factors, Index
+from rl2grid.arrays import F64, U16, Index
+from rl2grid.compile import borrowing_jit
+from rl2grid.powerflow.flow_state import Factors
 
 ONE, TWO, THREE = np.uint64(1), np.uint64(2), np.uint64(3)
 _SINGULAR = 1e-14

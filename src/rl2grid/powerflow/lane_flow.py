@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rl2grid.powerflow.borrowing import borrowing_jit
+from rl2grid.arrays import F64, I8, I32, Index
+from rl2grid.compile import borrowing_jit
 from rl2grid.powerflow.factors import ONE, TWO
-from rl2grid.powerflow.flow_state import ABSENT, F64, I32, Equations, FlowState, Index
+from rl2grid.powerflow.flow_state import ABSENT, Equations, FlowState
 from rl2grid.powerflow.lanes import WIDTH, Lanes, at, fma, larger, load, root, splat, store
 from rl2grid.powerflow.model import Network
-
-I8 = NDArray[np.int8]
+from rl2grid.structures import allocate, workspace
 
 RUNNING, LAST_STEP, DONE, FAILED, EMPTY = range(5)
 """States of a lane."""
@@ -33,34 +32,29 @@ _FARTHEST = 0.5
 
 
 class LaneFlow(NamedTuple):
-    """Power flows side by side; lanes [...] unless said otherwise."""
+    """Power flows side by side."""
 
-    voltage: Lanes  # [node, 2] per unit, real and imaginary
-    step: Lanes  # [unknown] mismatch, then Newton step
-    active: Lanes  # [1] 1.0 in lanes under way
-    norm: Lanes  # [1] of the mismatch, per unit
-    norm_before: Lanes  # [1]
-    distance: Lanes  # [1] largest change of a voltage since the base case, per unit
-    loading: Lanes  # [line] relative to the thermal limit, squared
-    worst: Lanes  # [1]
+    voltage: Annotated[Lanes, workspace("bus 2 lane", "by node; real and imaginary", "per unit")]
+    step: Annotated[Lanes, workspace("unknown lane", "mismatch, then Newton step")]
+    active: Annotated[Lanes, workspace("1 lane", "1.0 in lanes under way")]
+    norm: Annotated[Lanes, workspace("1 lane", "of the mismatch", "per unit")]
+    norm_before: Annotated[Lanes, workspace("1 lane", "of the mismatch a step ago", "per unit")]
+    distance: Annotated[Lanes, workspace("1 lane", "largest change of a voltage since the base case", "per unit")]
+    loading: Annotated[Lanes, workspace("line lane", "relative to the thermal limit, squared")]
+    worst: Annotated[Lanes, workspace("1 lane", "worst loading")]
 
-    state: I8  # [WIDTH] array, no lanes
-    action: I32  # [WIDTH] array, no lanes: entry of the request that a lane works for
-    admittance: F64  # [entry, 2] array, no lanes: of the lines that no lane treats in its own way
-    injection: F64  # [node, 2] array, no lanes
+    state: Annotated[I8, workspace("lane", "RUNNING, LAST_STEP, DONE, FAILED or EMPTY")]
+    action: Annotated[I32, workspace("lane", "entry of the request that a lane works for")]
+    admittance: Annotated[F64, workspace("entry 2", "of the lines that no lane treats in its own way", "per unit")]
+    injection: Annotated[F64, workspace("bus 2", "by node; active and reactive", "per unit")]
 
 
 def new_lane_flow(n_bus: int, n_line: int) -> LaneFlow:
     """Blank lanes for a grid."""
-
-    def lanes(*shape: int) -> Lanes:
-        return np.zeros((*shape, WIDTH))
-
-    return LaneFlow(
-        lanes(n_bus, 2), lanes(2 * n_bus), lanes(1), lanes(1), lanes(1), lanes(1), lanes(n_line), lanes(1),
-        np.full(WIDTH, EMPTY, np.int8), np.zeros(WIDTH, np.int32),
-        np.zeros((n_bus + 2 * n_line, 2)), np.zeros((n_bus, 2)),
-    )  # fmt: skip
+    sizes = {"bus": n_bus, "unknown": 2 * n_bus, "entry": n_bus + 2 * n_line, "line": n_line, "lane": WIDTH}
+    lanes = allocate(LaneFlow, sizes)
+    lanes.state[:] = EMPTY
+    return lanes
 
 
 @borrowing_jit

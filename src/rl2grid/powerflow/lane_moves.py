@@ -6,14 +6,14 @@ busbars are a border of at most four unknowns. Lanes differ in which element is 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rl2grid.powerflow.borrowing import borrowing_jit
+from rl2grid.arrays import F32, F64, I32, U32, Index
+from rl2grid.compile import borrowing_jit
 from rl2grid.powerflow.factors import factorise
-from rl2grid.powerflow.flow_state import ABSENT, F32, F64, I32, Equations, Factors, FlowState, Index
+from rl2grid.powerflow.flow_state import ABSENT, Equations, Factors, FlowState
 from rl2grid.powerflow.lane_flow import (
     LaneFlow,
     add_power,
@@ -33,8 +33,7 @@ from rl2grid.powerflow.lanes import WIDTH, Lanes, at, fma, larger, load, root, s
 from rl2grid.powerflow.model import Network
 from rl2grid.powerflow.newton import fill_jacobian
 from rl2grid.powerflow.paths import Paths, solve_backward, solve_forward, write_path, write_path_product
-
-U32 = NDArray[np.uint32]
+from rl2grid.structures import allocate, constant, workspace
 
 ORIGIN, EXTREMITY, GENERATOR, LOAD, STORAGE = range(5)
 """Kinds of elements."""
@@ -45,68 +44,59 @@ CONNECTED, SECOND, LINES, LOADS, GENERATORS, STORAGES = range(6)
 
 
 class Wiring(NamedTuple):
-    """Constants of a grid that a flow of one topology does not need; shapes in brackets."""
+    """Constants of a grid that a flow of one topology does not need."""
 
-    sub_first_element: I32  # [sub]
-    sub_info: I32  # [sub] elements
-    element_kind: I32  # [topo] ORIGIN, EXTREMITY, GENERATOR, LOAD or STORAGE
-    element_index: I32  # [topo] line, generator, load or storage
-    shunt: F64  # [sub, 2] per unit, admittance of the shunts on busbar 1
-    limit: F64  # [line] loading per unit of current at the origin
-    thermal_limit: F32  # [line] A
+    sub_first_element: Annotated[I32, constant("sub", "entry of its first element in topo_vect")]
+    sub_info: Annotated[I32, constant("sub", "number of its elements")]
+    element_kind: Annotated[I32, constant("topo", "ORIGIN, EXTREMITY, GENERATOR, LOAD or STORAGE")]
+    element_index: Annotated[I32, constant("topo", "line, generator, load or storage")]
+    shunt: Annotated[F64, constant("sub 2", "admittance of the shunts on busbar 1", "per unit")]
+    limit: Annotated[F64, constant("line", "loading per unit of current at the origin")]
+    thermal_limit: Annotated[F32, constant("line", "largest current", "A")]
 
 
 class Site(NamedTuple):
     """One substation in the base case. Bits stand for elements, in the order of ``topo_vect``."""
 
-    counts: I32  # [5]
-    members: U32  # [6] bits of elements
-    part: U32  # [part] lines that lead to each part of the rest of the grid
-    line: I32  # [element] lines that are closed: entry k of these arrays is the k-th of them
-    element: I32  # [element] bit of its end here
-    far: I32  # [element] node of its other end
-    begins: I32  # [element] 1 if its origin is here
-    admittance: F64  # [element, 8] here-here, here-there, there-here, there-there, each real, imaginary
-    voltage: F64  # [element, 2] of the busbar it is on
-    outward: F64  # [element, 2] power here that the other end's voltage makes
-    inward: F64  # [element, 2] power there that this end's voltage makes
-    coupling: F64  # [element, element, 4] derivative of power into line j by the voltage at line k, through the grid
-    supply: F64  # [element, 2] injection, per unit
-    setpoint: F64  # [element] per unit, of generators
-    label: I32  # [node] part of the rest of the grid
-    queue: I32  # [node] workspace
-    block: F64  # [2, 2] workspace
-    start: F64  # [2, 2] base voltage of each busbar, that of the other where one is empty
+    counts: Annotated[I32, workspace("5", "N_LINES, N_ELEMENTS, IS_SLACK, HAS_SHUNT, N_PARTS")]
+    members: Annotated[U32, workspace("6", "bits of elements: CONNECTED, SECOND, LINES, LOADS, GENERATORS, STORAGES")]
+    part: Annotated[U32, workspace("element", "by part of the rest of the grid: lines that lead to it")]
+    line: Annotated[I32, workspace("element", "closed lines: entry k of these arrays is the k-th of them")]
+    element: Annotated[I32, workspace("element", "bit of its end here")]
+    far: Annotated[I32, workspace("element", "node of its other end")]
+    begins: Annotated[I32, workspace("element", "1 if its origin is here")]
+    admittance: Annotated[
+        F64, workspace("element 8", "here-here, here-there, there-here, there-there, each real, imaginary")
+    ]
+    voltage: Annotated[F64, workspace("element 2", "of the busbar it is on")]
+    outward: Annotated[F64, workspace("element 2", "power here that the other end's voltage makes")]
+    inward: Annotated[F64, workspace("element 2", "power there that this end's voltage makes")]
+    coupling: Annotated[
+        F64,
+        workspace("element element 4", "derivative of power into line j by the voltage at line k, through the grid"),
+    ]
+    supply: Annotated[F64, workspace("element 2", "injection", "per unit")]
+    setpoint: Annotated[F64, workspace("element", "of generators", "per unit")]
+    label: Annotated[I32, workspace("bus", "by node: part of the rest of the grid")]
+    queue: Annotated[I32, workspace("bus", "of searches")]
+    block: Annotated[F64, workspace("2 2", "block of an inverse")]
+    start: Annotated[F64, workspace("2 2", "base voltage of each busbar, that of the other where one is empty")]
 
-    weight: Lanes  # [element] 1.0 on busbar 2, else 0.0
-    busbar: Lanes  # [2, 2] voltages
-    free: Lanes  # [4] 1.0 for an angle or magnitude to be found: of busbar 1, then of busbar 2
-    demand: Lanes  # [2, 2] power set, per unit
-    shunt: Lanes  # [2, 2] admittance
-    own: Lanes  # [2, 2] sums of here-here admittances and shunt
-    residual: Lanes  # [4] mismatch, then Newton step
-    inverse: Lanes  # [16] of the border's Schur complement
+    weight: Annotated[Lanes, workspace("element lane", "1.0 on busbar 2, else 0.0")]
+    busbar: Annotated[Lanes, workspace("2 2 lane", "voltages")]
+    free: Annotated[
+        Lanes, workspace("4 lane", "1.0 for an angle or magnitude to be found: of busbar 1, then of busbar 2")
+    ]
+    demand: Annotated[Lanes, workspace("2 2 lane", "power set", "per unit")]
+    shunt: Annotated[Lanes, workspace("2 2 lane", "admittance", "per unit")]
+    own: Annotated[Lanes, workspace("2 2 lane", "sums of here-here admittances and shunt", "per unit")]
+    residual: Annotated[Lanes, workspace("4 lane", "mismatch, then Newton step")]
+    inverse: Annotated[Lanes, workspace("16 lane", "of the border's Schur complement")]
 
 
 def new_site(n_bus: int, n_element: int) -> Site:
     """A blank site with room for ``n_element`` elements."""
-
-    def lanes(*shape: int) -> Lanes:
-        return np.zeros((*shape, WIDTH))
-
-    def floats(*shape: int) -> F64:
-        return np.zeros(shape)
-
-    def ints(*shape: int) -> I32:
-        return np.zeros(shape, np.int32)
-
-    return Site(
-        ints(5), np.zeros(6, np.uint32), np.zeros(n_element, np.uint32),
-        ints(n_element), ints(n_element), ints(n_element), ints(n_element), floats(n_element, 8), floats(n_element, 2),
-        floats(n_element, 2), floats(n_element, 2), floats(n_element, n_element, 4), floats(n_element, 2),
-        floats(n_element), ints(n_bus), ints(n_bus), floats(2, 2), floats(2, 2),
-        lanes(n_element), lanes(2, 2), lanes(4), lanes(2, 2), lanes(2, 2), lanes(2, 2), lanes(4), lanes(16),
-    )  # fmt: skip
+    return allocate(Site, {"bus": n_bus, "element": n_element, "lane": WIDTH})
 
 
 @borrowing_jit

@@ -5,12 +5,13 @@ The Jacobian changes by a matrix of rank four at most, in the rows and columns o
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from rl2grid.powerflow.borrowing import borrowing_jit
-from rl2grid.powerflow.flow_state import ABSENT, F64, I32, Equations, Factors, FlowState, Index
+from rl2grid.arrays import F64, I32, Index
+from rl2grid.compile import borrowing_jit
+from rl2grid.powerflow.flow_state import ABSENT, Equations, Factors, FlowState
 from rl2grid.powerflow.lane_flow import (
     RUNNING,
     LaneFlow,
@@ -26,34 +27,30 @@ from rl2grid.powerflow.lane_flow import (
 from rl2grid.powerflow.lanes import WIDTH, root, store
 from rl2grid.powerflow.model import Network
 from rl2grid.powerflow.paths import Paths, solve_backward, solve_forward, write_path_product
+from rl2grid.structures import allocate, workspace
 
 
 class Switches(NamedTuple):
-    """The line of each lane, and how the Jacobian answers; shapes in brackets."""
+    """The line of each lane, and how the Jacobian answers."""
 
-    line: I32  # [lane]
-    node: I32  # [lane, 2] of its origin and of its extremity
-    sign: F64  # [lane] 1.0 if it is opened, -1.0 if it is closed
-    gain: F64  # [lane, 4, 4] from the ends' answer in the base case to the change of the right-hand side
-    change: F64  # [4, 4] workspace: derivatives of the line's power
-    response: F64  # [4, 4] workspace: block of the inverse between the ends
-    system: F64  # [4, 8] workspace
-    block: F64  # [2, 2] workspace
-    answer: F64  # [4] workspace
-    seen: I32  # [node] workspace of searches
-    queue: I32  # [node]
+    line: Annotated[I32, workspace("lane")]
+    node: Annotated[I32, workspace("lane 2", "of its origin and of its extremity")]
+    sign: Annotated[F64, workspace("lane", "1.0 if it is opened, -1.0 if it is closed")]
+    gain: Annotated[
+        F64, workspace("lane 4 4", "from the ends' answer in the base case to the change of the right-hand side")
+    ]
+    change: Annotated[F64, workspace("4 4", "derivatives of the line's power")]
+    response: Annotated[F64, workspace("4 4", "block of the inverse between the ends")]
+    system: Annotated[F64, workspace("4 8", "equations of the gain")]
+    block: Annotated[F64, workspace("2 2", "block of an inverse")]
+    answer: Annotated[F64, workspace("4", "of the ends")]
+    seen: Annotated[I32, workspace("bus", "by node; of searches")]
+    queue: Annotated[I32, workspace("bus", "of searches")]
 
 
 def new_switches(n_bus: int) -> Switches:
     """Blank lanes."""
-
-    def floats(*shape: int) -> F64:
-        return np.zeros(shape)
-
-    return Switches(
-        np.zeros(WIDTH, np.int32), np.zeros((WIDTH, 2), np.int32), floats(WIDTH), floats(WIDTH, 4, 4), floats(4, 4),
-        floats(4, 4), floats(4, 8), floats(2, 2), floats(4), np.zeros(n_bus, np.int32), np.zeros(n_bus, np.int32),
-    )  # fmt: skip
+    return allocate(Switches, {"bus": n_bus, "lane": WIDTH})
 
 
 @borrowing_jit

@@ -11,48 +11,51 @@ import functools
 import hashlib
 import json
 from importlib import resources
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rl2grid.arrays import F32, F64, I32
 from rl2grid.errors import one_of
 from rl2grid.grids import GRID_IDS, Grid
-
-F64 = NDArray[np.float64]
-F32 = NDArray[np.float32]
-I32 = NDArray[np.int32]
+from rl2grid.structures import constant, fields_of
 
 
 class Network(NamedTuple):
-    """Constants of the power flow, all arrays, read-only; shapes in brackets.
+    """Constants of the power flow, read-only.
 
     A substation has two busbars. Bus ``sub`` is its busbar 1, bus ``sub + n_sub`` its busbar 2 (LightSim2Grid's
     numbering). Lines include transformers, in Grid2Op's order.
     """
 
-    base_power: F64  # [1] MVA (sn_mva)
-    tolerance: F64  # [1] largest mismatch of a converged flow, per unit of base_power
-    max_iterations: I32  # [1] Newton iterations before a flow counts as divergent
-    slack_gen: I32  # [1] generator that balances the flow; its bus has angle 0
+    base_power: Annotated[F64, constant("1", "LightSim2Grid's sn_mva", "MVA")]
+    tolerance: Annotated[F64, constant("1", "largest mismatch of a converged flow", "per unit of base_power")]
+    max_iterations: Annotated[I32, constant("1", "Newton iterations before a flow counts as divergent")]
+    slack_gen: Annotated[I32, constant("1", "generator that balances the flow; its bus has angle 0")]
 
-    nominal_voltage: F64  # [sub] kV
-    line_or_sub: I32  # [line]
-    line_ex_sub: I32  # [line]
-    line_or_position: I32  # [line] entry of topo_vect
-    line_ex_position: I32  # [line]
-    line_admittance: F64  # [line, 8] per unit: y11, y12, y21, y22, each as real, imaginary; 1 is the origin
-    line_susceptance: F64  # [line] per unit, of the DC flow (LightSim2Grid's ydc_11)
-    gen_sub: I32  # [gen]
-    gen_position: I32  # [gen]
-    gen_kilovolt: F32  # [gen] nominal kV by which set-points in kV are divided (prod_pu_to_kv)
-    gen_setpoint: F64  # [gen] per unit, where the series has no set-points
-    load_sub: I32  # [load]
-    load_position: I32  # [load]
-    storage_sub: I32  # [storage]
-    storage_position: I32  # [storage]
-    shunt_sub: I32  # [shunt] shunts in service; fixed on busbar 1
-    shunt_admittance: F64  # [shunt, 2] per unit, conductance and susceptance: conj(p + jq) / base_power
+    nominal_voltage: Annotated[F64, constant("sub", "nominal voltage", "kV")]
+    line_or_sub: Annotated[I32, constant("line", "substation of the origin")]
+    line_ex_sub: Annotated[I32, constant("line", "substation of the extremity")]
+    line_or_position: Annotated[I32, constant("line", "entry of the origin in topo_vect")]
+    line_ex_position: Annotated[I32, constant("line", "entry of the extremity in topo_vect")]
+    line_admittance: Annotated[
+        F64, constant("line 8", "y11, y12, y21, y22, each as real, imaginary; 1 is the origin", "per unit")
+    ]
+    line_susceptance: Annotated[F64, constant("line", "of the DC flow (LightSim2Grid's ydc_11)", "per unit")]
+    gen_sub: Annotated[I32, constant("gen", "substation")]
+    gen_position: Annotated[I32, constant("gen", "entry in topo_vect")]
+    gen_kilovolt: Annotated[
+        F32, constant("gen", "nominal voltage by which set-points in kV are divided (prod_pu_to_kv)", "kV")
+    ]
+    gen_setpoint: Annotated[F64, constant("gen", "voltage where the series has no set-points", "per unit")]
+    load_sub: Annotated[I32, constant("load", "substation")]
+    load_position: Annotated[I32, constant("load", "entry in topo_vect")]
+    storage_sub: Annotated[I32, constant("storage", "substation")]
+    storage_position: Annotated[I32, constant("storage", "entry in topo_vect")]
+    shunt_sub: Annotated[I32, constant("shunt", "substation of a shunt in service; fixed on busbar 1")]
+    shunt_admittance: Annotated[
+        F64, constant("shunt 2", "conductance and susceptance: conj(p + jq) / base_power", "per unit")
+    ]
 
 
 _FILED = (
@@ -68,7 +71,6 @@ _FILED = (
     "shunt_admittance",
 )
 """Fields read from the file; the others are the grid's."""
-_DTYPES: dict[str, Any] = {"max_iterations": np.int32, "shunt_sub": np.int32, "gen_kilovolt": np.float32}
 
 
 def read_network_record(grid_model: Any, tolerance: float, max_iterations: int) -> dict[str, Any]:
@@ -101,7 +103,8 @@ def read_network_record(grid_model: Any, tolerance: float, max_iterations: int) 
 
 def network_from_record(grid: Grid, record: dict[str, Any]) -> Network:
     """The network of ``grid`` from the record of :func:`read_network_record`."""
-    values: dict[str, Any] = {name: np.array(record[name], _DTYPES.get(name, np.float64)) for name in _FILED}
+    fields = fields_of(Network)
+    values: dict[str, Any] = {name: np.array(record[name], fields[name].dtype) for name in _FILED}
     values["shunt_admittance"] = values["shunt_admittance"].reshape(-1, 2)
     values |= {
         "slack_gen": np.array([grid.slack_gen], np.int32),

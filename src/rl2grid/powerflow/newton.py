@@ -9,9 +9,10 @@ import math
 
 import numpy as np
 
-from rl2grid.powerflow.borrowing import borrowing_jit
+from rl2grid.arrays import F32, F64, U16
+from rl2grid.compile import borrowing_jit
 from rl2grid.powerflow.factors import ONE, THREE, factorise, solve
-from rl2grid.powerflow.flow_state import ABSENT, F32, F64, U16, Equations, Factors, FlowState
+from rl2grid.powerflow.flow_state import ABSENT, Equations, Factors, FlowState
 from rl2grid.powerflow.model import Network
 
 _ROUND = 6755399441055744.0  # 1.5 * 2**52: adding and subtracting it rounds to the nearest whole number

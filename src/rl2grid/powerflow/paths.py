@@ -6,35 +6,31 @@ its rows of the inverse of U. Both vanish but on the node's path to the root of 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from rl2grid.powerflow.borrowing import borrowing_jit
+from rl2grid.arrays import F64, I32, U32, Index
+from rl2grid.compile import borrowing_jit
 from rl2grid.powerflow.factors import ONE, THREE, TWO
-from rl2grid.powerflow.flow_state import F64, I32, U32, Factors, Index
+from rl2grid.powerflow.flow_state import Factors
 from rl2grid.powerflow.lanes import Lanes, at, fma, load, store
+from rl2grid.structures import allocate, workspace
 
 
 class Paths(NamedTuple):
     """Rows of inverted factors, one slot per node asked for; a node without magnitude has zeros in column 1."""
 
-    size: I32  # [slot] unknowns on the path
-    unknown: U32  # [slot, unknown] ascending
-    left: F64  # [slot, unknown, 2] the node's rows of the inverse of U
-    right: F64  # [slot, unknown, 2] the node's columns of the inverse of L
-    dense: F64  # [unknown, 4] workspace, zero between calls
+    size: Annotated[I32, workspace("slot", "unknowns on the path")]
+    unknown: Annotated[U32, workspace("slot unknown", "ascending")]
+    left: Annotated[F64, workspace("slot unknown 2", "the node's rows of the inverse of U")]
+    right: Annotated[F64, workspace("slot unknown 2", "the node's columns of the inverse of L")]
+    dense: Annotated[F64, workspace("unknown 4", "zero between calls")]
 
 
 def new_paths(n_slots: int, n_unknowns: int) -> Paths:
     """Room for ``n_slots`` nodes of a matrix with ``n_unknowns`` rows."""
-    return Paths(
-        np.zeros(n_slots, np.int32),
-        np.empty((n_slots, n_unknowns), np.uint32),
-        np.empty((n_slots, n_unknowns, 2)),
-        np.empty((n_slots, n_unknowns, 2)),
-        np.zeros((n_unknowns, 4)),
-    )
+    return allocate(Paths, {"slot": n_slots, "unknown": n_unknowns})
 
 
 @borrowing_jit

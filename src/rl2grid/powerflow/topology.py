@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from rl2grid.arrays import I32, U16, U64, Index
+from rl2grid.compile import borrowing_jit
 from rl2grid.powerflow.bits import count_bits, lowest_bit
-from rl2grid.powerflow.borrowing import borrowing_jit
-from rl2grid.powerflow.flow_state import ABSENT, I32, U16, U64, FlowState, Index
+from rl2grid.powerflow.flow_state import ABSENT, FlowState
 from rl2grid.powerflow.model import Network
 
 _ONE = np.uint64(1)
@@ -42,9 +43,9 @@ def build_nodes(network: Network, flow: FlowState, i: int, topo_vect: I32) -> bo
         return False
     _number_nodes(network, flow, i)
     n_node = np.int64(flow.n_node[i])
-    adjacent = flow.sets[i, _ADJACENT]
+    adjacent = flow.sets[_ADJACENT]
     _join_nodes(flow.line_or_node[i], flow.line_ex_node[i], n_node, adjacent)
-    if not _is_connected(n_node, adjacent, flow.sets[i, _LOWER], flow.diagonal_entry[i]):
+    if not _is_connected(n_node, adjacent, flow.sets[_LOWER], flow.diagonal_entry[i]):
         return False
     _fill_admittance(network, flow, i, adjacent)
     return True
@@ -239,7 +240,7 @@ def measure_pattern(flow: FlowState, i: int) -> tuple[np.int64, np.int64]:
     """Find the fill of the factors of row ``i``; how many columns and values they have."""
     n_free = np.int64(flow.n_node[i]) - 1
     first_unknown = flow.first_unknown[i]
-    adjacent, lower, upper = flow.sets[i, _ADJACENT], flow.sets[i, _LOWER], flow.sets[i, _UPPER]
+    adjacent, lower, upper = flow.sets[_ADJACENT], flow.sets[_LOWER], flow.sets[_UPPER]
     words = adjacent.shape[1]
     for node in range(n_free):
         for word in range(words):
@@ -309,8 +310,8 @@ def write_pattern(flow: FlowState, i: int, column: U16) -> None:
     own_column, own_panel, first_panel = flow.own_column[i], flow.own_panel[i], flow.first_panel[i]
     entry_first, entry_node = flow.admittance_first[i], flow.admittance_node[i]
     entry_panel = flow.admittance_panel[i]
-    lower, upper = flow.sets[i, _LOWER], flow.sets[i, _UPPER]
-    place = flow.sets[i, _ADJACENT]  # no longer needed: now where each node's columns are
+    lower, upper = flow.sets[_LOWER], flow.sets[_UPPER]
+    place = flow.sets[_ADJACENT]  # no longer needed: now where each node's columns are
     for node in range(n_free):
         at = _write_columns(lower, node, np.int64(first_column[node]), first_unknown, column, place)
         size = np.int64(first_unknown[node + 1]) - np.int64(first_unknown[node])

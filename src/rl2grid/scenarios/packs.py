@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rl2grid.arrays import U8
 from rl2grid.compile import jit
 from rl2grid.errors import UsageError
 from rl2grid.grids import load_grid
@@ -26,7 +27,6 @@ from rl2grid.scenarios.generator.constants import load_constants
 from rl2grid.scenarios.generator.month import RawMonth
 
 I16 = NDArray[np.int16]
-U8 = NDArray[np.uint8]
 
 FORMAT = "rl2grid-pack-1"
 SUFFIX = ".pack"

@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rl2grid.arrays import F32, Flags
+
 STEP = timedelta(minutes=5)
 """Time between two rows."""
-
-Floats = NDArray[np.float32]
-Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,23 +39,23 @@ class Scenario:
     series_rows: int
     """Rows of the series that this is a window of."""
 
-    load_p: Floats = field(repr=False)
+    load_p: F32 = field(repr=False)
     """Demand, MW, float32 [rows, load]."""
-    load_q: Floats = field(repr=False)
+    load_q: F32 = field(repr=False)
     """Reactive demand, MVAr, float32 [rows, load]."""
-    prod_p: Floats = field(repr=False)
+    prod_p: F32 = field(repr=False)
     """Scheduled generation, MW, float32 [rows, gen]."""
-    prod_v: Floats | None = field(default=None, repr=False)
+    prod_v: F32 | None = field(default=None, repr=False)
     """Voltage set-points, kV, float32 [rows, gen]; None: the grid file's set-points hold."""
-    load_p_forecast: Floats | None = field(default=None, repr=False)
+    load_p_forecast: F32 | None = field(default=None, repr=False)
     """Forecast made at each row for the steps after it, MW, float32 [rows, horizon, load]."""
-    load_q_forecast: Floats | None = field(default=None, repr=False)
+    load_q_forecast: F32 | None = field(default=None, repr=False)
     """MVAr, float32 [rows, horizon, load]."""
-    prod_p_forecast: Floats | None = field(default=None, repr=False)
+    prod_p_forecast: F32 | None = field(default=None, repr=False)
     """MW, float32 [rows, horizon, gen]."""
-    prod_v_forecast: Floats | None = field(default=None, repr=False)
+    prod_v_forecast: F32 | None = field(default=None, repr=False)
     """kV, float32 [rows, horizon, gen]."""
-    maintenance: Bools | None = field(default=None, repr=False)
+    maintenance: Flags | None = field(default=None, repr=False)
     """Recorded planned outages, bool [rows, line]; None: nothing is recorded."""
 
     @property

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
-import numpy as np
-
+from rl2grid.arrays import F32, I32, Flags
 from rl2grid.compile import jit
 from rl2grid.grids import Grid
+from rl2grid.grids.axes import axis_sizes
 from rl2grid.mdp.actions import ActionKind
-from rl2grid.mdp.state import F32, I32, Flags, GridState
+from rl2grid.mdp.state import GridState
+from rl2grid.structures import allocate, row
 
 _MOVE, _SWITCH = int(ActionKind.MOVE), int(ActionKind.SWITCH)
 
@@ -17,26 +18,20 @@ _MOVE, _SWITCH = int(ActionKind.MOVE), int(ActionKind.SWITCH)
 class ActionNotes(NamedTuple):
     """Structure of arrays of ``n`` environments, right after the agent's own step."""
 
-    cooldown_left: I32  # [n] steps that the line or substation of a topology action still cooled down before it
-    terminated: Flags  # [n]
-    illegal: Flags  # [n]
-    ambiguous: Flags  # [n]
-    target_dispatch: F32  # [n, gen] MW
-    actual_dispatch: F32  # [n, gen] MW
-    storage_power: F32  # [n, storage] MW
+    cooldown_left: Annotated[
+        I32, row("", "that the line or substation of a topology action still cooled down before it", "steps")
+    ]
+    terminated: Annotated[Flags, row("", "game over")]
+    illegal: Annotated[Flags, row("", "the action broke a rule")]
+    ambiguous: Annotated[Flags, row("", "the action had no single meaning")]
+    target_dispatch: Annotated[F32, row("gen", "dispatch asked for", "MW")]
+    actual_dispatch: Annotated[F32, row("gen", "dispatch carried out", "MW")]
+    storage_power: Annotated[F32, row("storage", "positive charges", "MW")]
 
 
 def new_action_notes(grid: Grid, n: int) -> ActionNotes:
     """Blank notes."""
-    return ActionNotes(
-        np.zeros(n, np.int32),
-        np.zeros(n, np.bool_),
-        np.zeros(n, np.bool_),
-        np.zeros(n, np.bool_),
-        np.zeros((n, grid.n_gen), np.float32),
-        np.zeros((n, grid.n_gen), np.float32),
-        np.zeros((n, grid.n_storage), np.float32),
-    )
+    return allocate(ActionNotes, axis_sizes(grid), n)
 
 
 def copy_notes(notes: ActionNotes) -> ActionNotes:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from rl2grid.arrays import F32
 from rl2grid.compile import jit
 from rl2grid.engines.native.action_notes import note_after, note_before
 from rl2grid.engines.native.environments import Environments, open_environments
@@ -17,7 +18,7 @@ from rl2grid.mdp.actions import ActionKind
 from rl2grid.mdp.features import write_redispatch_observation, write_topology_observation
 from rl2grid.mdp.heuristics import is_safe, reconnect_action, recovery_action
 from rl2grid.mdp.rewards import default_components, paper_components, released_components
-from rl2grid.mdp.state import F32, GridState
+from rl2grid.mdp.state import GridState
 
 RESET = -1
 """In place of an :class:`~rl2grid.mdp.actions.ActionKind`: show the first row of the episode."""

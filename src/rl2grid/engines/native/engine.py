@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 
+from rl2grid.arrays import F32
 from rl2grid.engines import DISPATCHES
 from rl2grid.engines.native.entry import (
     begin_one,
     begin_simulation_one,
-    copy_flow_one,
+    copy_one,
     dispatch_one,
     finish_one,
     finish_simulation_one,
@@ -27,16 +28,16 @@ from rl2grid.grids import Grid
 from rl2grid.handles import Handle
 from rl2grid.mdp.actions import DO_NOTHING, ActionKind, StepAction
 from rl2grid.mdp.opponents import OpponentDraws, draw_opponent, load_draws
-from rl2grid.mdp.state import F32, GridState
+from rl2grid.mdp.state import GridState
 from rl2grid.mdp.termination import GameOver
 from rl2grid.powerflow.model import Network, load_network
 from rl2grid.scenarios.episodes import EpisodePlan, maintenance_matrix
 from rl2grid.scenarios.library import load_scenario
 from rl2grid.scenarios.scenario import Scenario
 from rl2grid.streams import Purpose, Stream
+from rl2grid.structures import with_own_workspace
 
 _NO_VALUES = np.zeros(0, np.float32)
-_FIRST_DYNAMIC = GridState._fields.index("gen_p")
 
 
 class NativeEngine:
@@ -74,7 +75,7 @@ class NativeEngine:
     def reset(self, i: int, plan: EpisodePlan) -> None:
         """Begin the episode ``plan`` in environment ``i``."""
         self.prepare(i, plan)
-        reset_one(self.handle.address, i)
+        reset_one(self.address, i)
 
     def prepare(self, i: int, plan: EpisodePlan) -> None:
         """Hand environment ``i`` the episode ``plan``; its first row is not shown yet."""
@@ -128,12 +129,12 @@ class NativeEngine:
         """Play one grid step of environment ``i``."""
         command = _command(action)
         if self.dispatch == "exact":
-            step_one(self.handle.address, i, *command)
+            step_one(self.address, i, *command)
             return
-        if begin_one(self.handle.address, i, *command, False) and not self._dispatch_like_grid2op(self.environments, i):
-            lose_one(self.handle.address, i)
+        if begin_one(self.address, i, *command, False) and not self._dispatch_like_grid2op(self.environments, i):
+            lose_one(self.address, i)
             return
-        finish_one(self.handle.address, i)
+        finish_one(self.address, i)
 
     def simulate(self, i: int, action: StepAction, horizon: int) -> GridState:
         """One step on the forecast; what it does is described in ``docs/simulate.md``."""
@@ -160,10 +161,22 @@ class NativeEngine:
         """Let go of the series."""
         self._scenarios = [None] * len(self._scenarios)
 
+    @property
+    def address(self) -> int:
+        """Where compiled code finds the environments, for one thread at a time; see :meth:`address_for`."""
+        return self._handles[0].address
+
+    def address_for(self, thread: int) -> int:
+        """The same environments with a workspace for thread ``thread``: threads may then play different rows."""
+        while len(self._handles) <= thread:
+            flow = with_own_workspace(self.environments.flow)
+            self._handles.append(Handle(self.environments._replace(flow=flow)))
+        return self._handles[thread].address
+
     def _use(self, environments: Environments) -> None:
         self.environments = environments
         self.state = environments.state
-        self.handle = Handle(environments)
+        self._handles = [Handle(environments)]
 
     def _make_room(self, outages: int) -> None:
         """Grow the arrays to hold that many planned outages per environment."""
@@ -185,19 +198,14 @@ class NativeEngine:
         if scenario.load_p_forecast is None or horizon > scenario.load_p_forecast.shape[1]:
             raise UsageError(f"Scenario {scenario.id!r} has no forecast {horizon} steps ahead.")
         self._copy_row(i)
-        exact, simulated, real = self.dispatch == "exact", self._simulated.address, self.handle.address
+        exact, simulated, real = self.dispatch == "exact", self._simulated.address, self.address
         needed = begin_simulation_one(simulated, real, i, *_command(action), horizon, exact)
         return not needed or self._find_simulated_dispatch()
 
     def _copy_row(self, i: int) -> None:
         """Bring the simulated environment to where environment ``i`` is."""
-        source, target = self.environments, self._simulated.structure
-        for name in GridState._fields[_FIRST_DYNAMIC:]:
-            getattr(target.state, name)[0] = getattr(source.state, name)[i]
-        for name in HiddenState._fields[: HiddenState._fields.index("new_p")]:
-            getattr(target.hidden, name)[0] = getattr(source.hidden, name)[i]
-        target.state.truncated[0] = False
-        copy_flow_one(self.handle.address, i, self._simulated.address, 0)
+        copy_one(self.address, i, self._simulated.address, 0)
+        self._simulated.structure.state.truncated[0] = False
 
     def _find_simulated_dispatch(self) -> bool:
         """Dispatch the simulated environment, or end its episode."""

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from rl2grid.arrays import F32
 from rl2grid.compile import jit
 from rl2grid.engines.native.environments import open_environments
 from rl2grid.engines.native.generation import set_generators
 from rl2grid.engines.native.simulation import begin_simulation, finish_simulation
 from rl2grid.engines.native.step import begin_step, dispatch_or_lose, finish_step, lose_by_dispatch, reset_row
-from rl2grid.mdp.state import F32
-from rl2grid.powerflow.ac import copy_flow
+from rl2grid.structures import copy_row
 
 
 @jit
@@ -81,6 +81,9 @@ def finish_simulation_one(address: int) -> None:
 
 
 @jit
-def copy_flow_one(source: int, i: int, target: int, j: int) -> None:
-    """Copy the power flow of environment ``i`` to that of environment ``j`` of another engine of the grid."""
-    copy_flow(open_environments(source).flow, i, open_environments(target).flow, j)
+def copy_one(source: int, i: int, target: int, j: int) -> None:
+    """Bring environment ``j`` of another engine of the grid to where ``i`` is, for a step without opponent."""
+    here, there = open_environments(source), open_environments(target)
+    copy_row(here.state, i, there.state, j)
+    copy_row(here.hidden, i, there.hidden, j)
+    copy_row(here.flow, i, there.flow, j)

@@ -8,12 +8,12 @@ from typing import NamedTuple
 from rl2grid.engines.native.action_notes import ActionNotes, new_action_notes
 from rl2grid.engines.native.constants import GridConstants, new_constants
 from rl2grid.engines.native.hidden_state import HiddenState, new_hidden_state
-from rl2grid.grids import Grid, OpponentConfig, load_grid
-from rl2grid.handles import layout_of, opener
+from rl2grid.grids import Grid, OpponentConfig
+from rl2grid.handles import opener
 from rl2grid.mdp.opponents import OpponentState, new_opponent_state
 from rl2grid.mdp.state import GridState, new_state
 from rl2grid.powerflow.ac import FlowState, new_flow_state
-from rl2grid.powerflow.model import Network, load_network
+from rl2grid.powerflow.model import Network
 
 
 class Environments(NamedTuple):
@@ -46,7 +46,5 @@ def new_environments(grid: Grid, network: Network, n: int, opponent: bool, outag
     )
 
 
-# Layouts are the same for every grid: names, dtypes and axes.
-open_environments = opener(
-    layout_of(new_environments(load_grid("bus14"), load_network(load_grid("bus14")), 1, opponent=False))
-)
+open_environments = opener(Environments)
+"""From the address of a handle to the environments, in compiled code."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from rl2grid.arrays import F32
 from rl2grid.compile import jit
 from rl2grid.engines.dispatch import (
     NEGLIGIBLE,
@@ -18,7 +19,7 @@ from rl2grid.engines.dispatch import (
 )
 from rl2grid.engines.native.constants import INITIAL_CHARGE
 from rl2grid.engines.native.environments import Environments
-from rl2grid.mdp.state import F32, GridState
+from rl2grid.mdp.state import GridState
 
 _FULL = np.float32(1.0)
 _NONE = np.float32(0.0)

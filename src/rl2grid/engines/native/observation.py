@@ -1,4 +1,4 @@
-"""The observed attributes after a step (Grid2Op's ``CompleteObservation``), and the blank ones after a game over."""
+"""The observed attributes after a step (Grid2Op's ``CompleteObservation``)."""
 
 from __future__ import annotations
 
@@ -48,33 +48,3 @@ def _observe_generators(state: GridState, i: int) -> None:
         room_down = min(produced - state.gen_pmin[gen], state.gen_max_ramp_down[gen])
         state.gen_margin_up[i, gen] = max(room_up, _NONE)
         state.gen_margin_down[i, gen] = max(room_down, _NONE)
-
-
-@jit
-def blank_row(state: GridState, i: int) -> None:
-    """What Grid2Op shows after a game over: no topology, no maintenance, no limits, all else zero."""
-    state.gen_p[i] = 0.0
-    state.gen_theta[i] = 0.0
-    state.load_p[i] = 0.0
-    state.load_theta[i] = 0.0
-    state.p_or[i] = 0.0
-    state.a_or[i] = 0.0
-    state.rho[i] = 0.0
-    state.line_status[i] = False
-    state.topo_vect[i] = -1
-    state.timestep_overflow[i] = 0
-    state.time_before_cooldown_line[i] = 0
-    state.time_before_cooldown_sub[i] = 0
-    state.time_next_maintenance[i] = -1
-    state.duration_next_maintenance[i] = 0
-    state.target_dispatch[i] = 0.0
-    state.actual_dispatch[i] = 0.0
-    state.gen_margin_up[i] = 0.0
-    state.gen_margin_down[i] = 0.0
-    state.gen_p_before_curtail[i] = 0.0
-    state.curtailment[i] = 0.0
-    state.curtailment_limit[i] = 1.0
-    state.storage_charge[i] = 0.0
-    state.storage_power_target[i] = 0.0
-    state.storage_power[i] = 0.0
-    state.storage_theta[i] = 0.0

@@ -13,10 +13,10 @@ from numba.core import types
 from numba.core.extending import intrinsic
 from numpy.typing import NDArray
 
+from rl2grid.arrays import F32
 from rl2grid.compile import jit
 from rl2grid.engines.native.environments import Environments
 from rl2grid.engines.native.hidden_state import LOAD_P, LOAD_Q, PROD_P, PROD_V, HiddenState
-from rl2grid.mdp.state import F32
 
 
 @intrinsic  # type: ignore[untyped-decorator]
@@ -85,8 +85,7 @@ def _value(address: int, index: int) -> np.float32:
 
 @jit
 def begin_outages(hidden: HiddenState, i: int) -> None:
-    """Point every line of row ``i`` at its first planned outage."""
-    hidden.next_outage[i] = -1
+    """Point every line of the blank row ``i`` at its first planned outage."""
     for k in range(hidden.outage_count[i] - 1, -1, -1):
         hidden.next_outage[i, hidden.outage_line[i, k]] = k
 

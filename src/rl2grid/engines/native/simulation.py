@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from rl2grid.arrays import F32
 from rl2grid.compile import jit
 from rl2grid.engines.native.environments import Environments
 from rl2grid.engines.native.generation import decode_injection, request_is_impossible, set_generators
@@ -11,7 +12,6 @@ from rl2grid.engines.native.series import read_forecast
 from rl2grid.engines.native.step import nobody_injects, prepare_dispatch, run_and_register
 from rl2grid.engines.native.topology import act_on_topology, open_line
 from rl2grid.mdp.actions import ActionKind
-from rl2grid.mdp.state import F32
 
 _INJECTION = int(ActionKind.INJECTION)
 _FULL_LOAD = np.float32(1.0)

@@ -7,6 +7,7 @@
 
 from __future__ import annotations
 
+from rl2grid.arrays import F32
 from rl2grid.compile import jit
 from rl2grid.engines.native.environments import Environments
 from rl2grid.engines.native.generation import (
@@ -22,16 +23,17 @@ from rl2grid.engines.native.generation import (
     target_is_out_of_reach,
     use_storage,
 )
-from rl2grid.engines.native.hidden_state import HiddenState, begin_hidden_state
-from rl2grid.engines.native.observation import blank_row, observe
+from rl2grid.engines.native.hidden_state import HiddenState
+from rl2grid.engines.native.observation import observe
 from rl2grid.engines.native.protections import flow_with_cascade
 from rl2grid.engines.native.series import begin_outages, plan_outages, read_row
 from rl2grid.engines.native.topology import act_on_topology, open_line, remember_busbars
 from rl2grid.mdp.actions import ActionKind
 from rl2grid.mdp.opponents import opponent_step
-from rl2grid.mdp.state import F32, GridState
+from rl2grid.mdp.state import GridState
 from rl2grid.mdp.termination import GameOver, game_over_reason
 from rl2grid.powerflow.ac import forget_flow
+from rl2grid.structures import blank_row
 
 _INJECTION = int(ActionKind.INJECTION)
 _DISPATCH = int(GameOver.DISPATCH)
@@ -44,7 +46,7 @@ def reset_row(environments: Environments, i: int) -> None:
     Grid2Op plays a step for that: nobody acts, overloads are not counted, but lines above the hard limit trip.
     """
     state, hidden, flow = environments.state, environments.hidden, environments.flow
-    begin_hidden_state(hidden, i)
+    blank_row(hidden, i)
     begin_generation(environments, i)
     begin_outages(hidden, i)
     forget_flow(flow, i)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rl2grid.arrays import F32, I64
 from rl2grid.engines.effects import clipping, refusal
 from rl2grid.engines.native.action_notes import ActionNotes, copy_notes
 from rl2grid.engines.native.advance import (
@@ -31,10 +32,7 @@ from rl2grid.engines.transition import Transitions
 from rl2grid.grids import Grid
 from rl2grid.mdp.actions import ActionKind, StepAction
 from rl2grid.mdp.rewards import default_components, paper_components, released_components
-from rl2grid.mdp.state import F32
 from rl2grid.scenarios.episodes import EpisodePlan
-
-I64 = NDArray[np.int64]
 
 _COMPILED_IN: dict[Callable[..., Any], int] = {
     default_components: DEFAULT,
@@ -134,7 +132,7 @@ class NativeTransitions(Transitions):
         if not self.is_compiled:
             super().play(i, action)
             return
-        self._advance_part(self._rows[i : i + 1], _one(action))
+        self._advance_part(self.engine.address, self._rows[i : i + 1], _one(action))
         notes = self.engine.environments.notes
         refused = refusal(action, int(notes.cooldown_left[i]))
         self.effects[i] = refused or clipping(self.engine.grid, notes, i, action)
@@ -153,7 +151,7 @@ class NativeTransitions(Transitions):
 
     def write_observations(self, rows: I64, shift: F32, scale: F32, out: F32) -> None:
         """Write the observations of ``rows``, shifted and scaled, to the same rows of ``out``, float32 [n, feature]."""
-        write_observations(self.engine.handle.address, rows, self.topology_task, shift, scale, out)
+        write_observations(self.engine.address, rows, self.topology_task, shift, scale, out)
 
     def effects_of(self, commands: Commands) -> NDArray[np.object_]:
         """What became of the actions of all environments, object [n]."""
@@ -167,16 +165,21 @@ class NativeTransitions(Transitions):
     def _advance(self, rows: I64, commands: Commands, num_threads: int) -> None:
         parts = max(1, min(num_threads, len(rows) // _ROWS_PER_THREAD))
         if parts == 1:
-            self._advance_part(rows, commands)
+            self._advance_part(self.engine.address, rows, commands)
             return
         bounds = [len(rows) * part // parts for part in range(parts + 1)]
         slices = [slice(first, last) for first, last in itertools.pairwise(bounds)]
-        list(self._threads.map(lambda part: self._advance_part(rows[part], commands[part]), slices))
+        addresses = [self.engine.address_for(thread) for thread in range(parts)]
 
-    def _advance_part(self, rows: I64, commands: Commands) -> None:
+        def advance_slice(address: int, part: slice) -> None:
+            self._advance_part(address, rows[part], commands[part])
+
+        list(self._threads.map(advance_slice, addresses, slices))
+
+    def _advance_part(self, address: int, rows: I64, commands: Commands) -> None:
         weights = self.reward.weights
         advance(
-            self.engine.handle.address,
+            address,
             rows,
             commands.kinds,
             commands.targets,

@@ -11,8 +11,8 @@ from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rl2grid.arrays import F32, I8, I32, Flags
 from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.engines.native.environments import Environments
 from rl2grid.errors import UsageError
@@ -33,11 +33,6 @@ from rl2grid.powerflow.batch import (
     new_wiring,
 )
 from rl2grid.powerflow.model import Network, load_network
-
-F32 = NDArray[np.float32]
-I8 = NDArray[np.int8]
-I32 = NDArray[np.int32]
-Flags = NDArray[np.bool_]
 
 _KINDS = np.full(len(ActionKind), -1, np.int8)
 _KINDS[[ActionKind.NOTHING, ActionKind.MOVE, ActionKind.SWITCH]] = NOTHING, MOVE, SWITCH

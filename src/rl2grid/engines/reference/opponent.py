@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 from grid2op.Opponent import OpponentSpace
 
-from rl2grid.mdp.opponents import OpponentState, attack, copy_opponent
+from rl2grid.mdp.opponents import OpponentState, attack
 from rl2grid.mdp.state import GridState
+from rl2grid.structures import row_of
 
 
 def install_opponent(env: Any, state: GridState, opponent: OpponentState | None, row: int) -> None:
@@ -94,8 +95,8 @@ class OpponentBridge(OpponentSpace):  # type: ignore[misc]
         """A snapshot that a copy of the environment continues from."""
         if self._followed is None:
             return None, None
-        return copy_opponent(self._followed, self._row), None
+        return row_of(self._followed, self._row), None
 
     def _set_state(self, my_state: OpponentState | None, opp_state: object = None) -> None:
         if my_state is not None:
-            self.follow(copy_opponent(my_state, 0), 0, None)
+            self.follow(row_of(my_state, 0), 0, None)

@@ -7,12 +7,10 @@ additions, multiplications, divisions and square roots, which IEEE 754 rounds co
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rl2grid.arrays import F64
 from rl2grid.compile import jit
 from rl2grid.scenarios.generator.draws import Draws
-
-F64 = NDArray[np.float64]
 
 _TWO_PI = 6.283185307179586
 _PART = np.int64(8191)

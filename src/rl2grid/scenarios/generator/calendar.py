@@ -5,8 +5,8 @@ from __future__ import annotations
 from datetime import datetime, timedelta
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rl2grid.arrays import F64, I64
 from rl2grid.compile import jit
 
 ROWS_PER_HOUR = 12
@@ -17,9 +17,6 @@ MONTH_STEPS = 28 * ROWS_PER_DAY
 MONTH_ROWS = MONTH_STEPS + 1
 YEAR_ROWS = MONTHS * MONTH_STEPS + 1
 """A year is 12 blocks of 28 days from January 1st."""
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 
 def month_start(year: int, month: int) -> datetime:

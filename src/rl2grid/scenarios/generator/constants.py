@@ -12,12 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rl2grid.arrays import F32, F64, I64
 from rl2grid.errors import one_of
 from rl2grid.grids import GRID_IDS
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 
 class DemandConstants(NamedTuple):

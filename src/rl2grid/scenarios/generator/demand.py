@@ -10,8 +10,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rl2grid.arrays import F64, I32, I64
 from rl2grid.compile import jit
 from rl2grid.grids import Grid
 from rl2grid.scenarios.generator.arithmetic import rounded, to_gaussian
@@ -19,10 +19,6 @@ from rl2grid.scenarios.generator.calendar import ROWS_PER_DAY, day_kinds, season
 from rl2grid.scenarios.generator.constants import Constants, DemandConstants
 from rl2grid.scenarios.generator.draws import Channel, Draws, Portion
 from rl2grid.scenarios.generator.fields import Field, neighbourly, new_field, new_independent_field, value
-
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
 
 _REGIONAL_ROWS = 96
 _SLOW_ROWS = 4 * ROWS_PER_DAY

@@ -11,19 +11,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rl2grid.arrays import F64, I32, I64, Flags
 from rl2grid.compile import jit
 from rl2grid.grids import Grid
 from rl2grid.scenarios.generator.calendar import ROWS_PER_DAY, seasonal
 from rl2grid.scenarios.generator.constants import Constants, SupplyConstants
 from rl2grid.scenarios.generator.draws import Channel, Portion
 from rl2grid.scenarios.generator.fields import Field, new_independent_field, value
-
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 _RAMP_SHARE = 9.8
 """Ramps in 0.1 MW keep 2 percent in hand: rounding must not break them."""
@@ -42,8 +37,8 @@ class Market(NamedTuple):
 
     supply: SupplyConstants
     ramp: I64  # [unit] 0.1 MW per step
-    nuclear: Bools  # [unit]
-    thermal: Bools  # [unit]
+    nuclear: Flags  # [unit]
+    thermal: Flags  # [unit]
     drift: Field  # noise of the price of each unit
 
 

@@ -9,15 +9,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rl2grid.arrays import F64, I32
 from rl2grid.compile import jit
 from rl2grid.grids import Grid
 from rl2grid.scenarios.generator.arithmetic import gaussians
 from rl2grid.scenarios.generator.draws import Channel, Portion
-
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
 
 _MESH = 4
 """Places of the mesh per direction."""

@@ -5,17 +5,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rl2grid.arrays import F32, F64, I32
 from rl2grid.compile import jit
 from rl2grid.grids import Grid
 from rl2grid.scenarios.generator.arithmetic import rounded, to_gaussian
 from rl2grid.scenarios.generator.constants import Constants, ForecastConstants
 from rl2grid.scenarios.generator.draws import Channel, Draws
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
 
 
 class Forecasts(NamedTuple):

@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rl2grid.arrays import F64, I32, I64
 from rl2grid.compile import jit
 from rl2grid.grids import Grid
 from rl2grid.scenarios.generator.arithmetic import exponential, rounded, sine
@@ -18,10 +18,6 @@ from rl2grid.scenarios.generator.calendar import ROWS_PER_DAY
 from rl2grid.scenarios.generator.constants import RenewableConstants
 from rl2grid.scenarios.generator.draws import Channel, Draws, Portion
 from rl2grid.scenarios.generator.fields import Field, neighbourly, new_field, value
-
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
 
 _WEEK_ROWS, _HOURS_ROWS, _GUST_ROWS = 7 * ROWS_PER_DAY, 72, 6
 _CLOUD_DAY_ROWS, _CLOUD_HOURS_ROWS = ROWS_PER_DAY, 24

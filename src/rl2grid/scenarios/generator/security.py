@@ -7,18 +7,13 @@ import functools
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rl2grid.arrays import F32, I32, I64
 from rl2grid.compile import jit
 from rl2grid.grids import Grid
 from rl2grid.powerflow.ac import CONVERGED, FlowState, new_flow_state, run_flow, write_currents, write_flow
 from rl2grid.powerflow.model import Network, load_network
 from rl2grid.scenarios.generator.arithmetic import rounded
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
 
 
 class Verdict(NamedTuple):

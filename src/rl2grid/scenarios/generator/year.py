@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rl2grid.arrays import I32, I64
 from rl2grid.compile import jit
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
@@ -26,8 +27,6 @@ from rl2grid.scenarios.generator.renewables import new_weather, renewable_produc
 from rl2grid.scenarios.generator.security import assess
 
 I16 = NDArray[np.int16]
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
 
 MAX_SEED = 2**63 - 1
 LONGEST_HORIZON = ROWS_PER_HOUR
