@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from rl2grid.engines.action_effects import clipping, cooldown_left, refusal
 from rl2grid.engines.base import Engine
-from rl2grid.engines.effects import clipping, cooldown_left, refusal
 from rl2grid.mdp.accumulate import accrue, begin_episode, begin_transition
 from rl2grid.mdp.actions import DO_NOTHING, StepAction
 from rl2grid.mdp.heuristics import is_safe, reconnect_action, recovery_action
@@ -35,14 +35,14 @@ class Transitions:
     gamma: float
     """Discount between the grid steps of a transition."""
     listeners: list[Listener] = field(default_factory=list)
-    effects: dict[int, str] = field(default_factory=dict)
+    action_effects: dict[int, str] = field(default_factory=dict)
     """By row: what was refused or clipped of the agent's last action."""
 
     def reset(self, i: int, plan: EpisodePlan) -> None:
         """Begin an episode and play to its first decision."""
         state = self.engine.state
         self.engine.reset(i, plan)
-        self.effects[i] = ""
+        self.action_effects[i] = ""
         begin_episode(state, i)
         self._announce(i)
         self._play_heuristic(i)
@@ -58,7 +58,7 @@ class Transitions:
         state.decisions[i] += 1
         refused = refusal(action, cooldown_left(state, i, action))
         self._step(i, action)
-        self.effects[i] = refused or clipping(self.engine.grid, state, i, action)
+        self.action_effects[i] = refused or clipping(self.engine.grid, state, i, action)
         illegal, ambiguous = state.illegal[i], state.ambiguous[i]
         self._play_heuristic(i)
         state.illegal[i], state.ambiguous[i] = illegal, ambiguous

@@ -81,7 +81,7 @@ class EngineRows(Environments, ABC, Generic[Decisions]):
         for i, saved in enumerate(rows):
             self.replay(i, saved)
         effects = np.empty(self._n, object)
-        effects[:] = [self.transitions.effects[i] for i in range(self._n)]
+        effects[:] = [self.transitions.action_effects[i] for i in range(self._n)]
         return self._batch(effects)
 
     @abstractmethod
@@ -143,7 +143,7 @@ class EngineRows(Environments, ABC, Generic[Decisions]):
     def _ending(self, i: int, effect: str) -> dict[str, Any]:
         observation = np.zeros(self._size, np.float32)
         self.write_observation(i, observation)
-        self.transitions.effects[i] = effect
+        self.transitions.action_effects[i] = effect
         return {"final_obs": observation, "final_info": self.info(i)}
 
     def _batch(self, effects: NDArray[np.object_]) -> Batch:

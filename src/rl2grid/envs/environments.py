@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from rl2grid.engines.action_effects import clipping, cooldown_left, refusal
 from rl2grid.engines.base import Engine
-from rl2grid.engines.effects import clipping, cooldown_left, refusal
 from rl2grid.engines.transition import Transitions
 from rl2grid.envs.description import action_number
 from rl2grid.envs.info import episode_info
@@ -157,7 +157,7 @@ class Environments:
         plan, position, state = self._plans[i], self._position(i), self.state
         assert plan is not None
         info = {**_start_info(plan), **episode_info(state, i, self.constraint)}
-        info["action_effect"] = self.transitions.effects[i]
+        info["action_effect"] = self.transitions.action_effects[i]
         info["grid_steps"] = position.grid_steps + info["step"]
         info["over"] = bool(self._pending[i])
         if self.options.gamma is not None:

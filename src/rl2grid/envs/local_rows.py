@@ -25,7 +25,7 @@ class LocalRows(EngineRows[list[StepAction]]):
 
     def _effects(self, decisions: list[StepAction]) -> NDArray[np.object_]:
         effects = np.empty(self._n, object)
-        effects[:] = [self.transitions.effects[i] for i in range(self._n)]
+        effects[:] = [self.transitions.action_effects[i] for i in range(self._n)]
         return effects
 
     def _start(self, rows: list[int], plans: list[EpisodePlan]) -> None:

@@ -33,7 +33,7 @@ class NativeRows(EngineRows[Commands]):
         self.transitions.play_rows(rows, decisions.take(rows), self._num_threads)
 
     def _effects(self, decisions: Commands) -> NDArray[np.object_]:
-        return self.transitions.effects_of(decisions)
+        return self.transitions.action_effects_of(decisions)
 
     def _start(self, rows: list[int], plans: list[EpisodePlan]) -> None:
         if not self.transitions.is_compiled:
@@ -42,7 +42,7 @@ class NativeRows(EngineRows[Commands]):
             return
         for i, plan in zip(rows, plans, strict=True):
             self.transitions.engine.prepare(i, plan)
-            self.transitions.effects[i] = ""
+            self.transitions.action_effects[i] = ""
         self.transitions.begin_rows(np.array(rows), self._num_threads)
 
     def _observations(self) -> NDArray[np.float32]:

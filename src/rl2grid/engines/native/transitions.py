@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rl2grid.arrays import F32, I64
-from rl2grid.engines.effects import clipping, refusal
+from rl2grid.engines.action_effects import clipping, refusal
 from rl2grid.engines.native.action_notes import ActionNotes, copy_notes
 from rl2grid.engines.native.advance import (
     ALONE,
@@ -124,7 +124,7 @@ class NativeTransitions(Transitions):
             super().reset(i, plan)
             return
         self.engine.prepare(i, plan)
-        self.effects[i] = ""
+        self.action_effects[i] = ""
         self.begin_rows(self._rows[i : i + 1], 1)
 
     def play(self, i: int, action: StepAction) -> None:
@@ -135,7 +135,7 @@ class NativeTransitions(Transitions):
         self._advance_part(self.engine.address, self._rows[i : i + 1], _one(action))
         notes = self.engine.environments.notes
         refused = refusal(action, int(notes.cooldown_left[i]))
-        self.effects[i] = refused or clipping(self.engine.grid, notes, i, action)
+        self.action_effects[i] = refused or clipping(self.engine.grid, notes, i, action)
 
     def play_rows(self, rows: I64, commands: Commands, num_threads: int) -> None:
         """Play one transition in each of ``rows``, entry k of ``commands`` in row ``rows[k]``."""
@@ -153,10 +153,10 @@ class NativeTransitions(Transitions):
         """Write the observations of ``rows``, shifted and scaled, to the same rows of ``out``, float32 [n, feature]."""
         write_observations(self.engine.address, rows, self.topology_task, shift, scale, out)
 
-    def effects_of(self, commands: Commands) -> NDArray[np.object_]:
+    def action_effects_of(self, commands: Commands) -> NDArray[np.object_]:
         """What became of the actions of all environments, object [n]."""
         if not self.is_compiled:
-            return np.array([self.effects[i] for i in range(len(commands.kinds))], object)
+            return np.array([self.action_effects[i] for i in range(len(commands.kinds))], object)
         grid, notes = self.engine.grid, copy_notes(self.engine.environments.notes)
         effects = np.empty(len(commands.kinds), object)
         effects[:] = [ActionEffect(grid, notes, commands, i) for i in range(len(effects))]
