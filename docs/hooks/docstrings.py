@@ -1,11 +1,17 @@
-"""Makes the docstrings Markdown: roles become links, tables of restructured text and literal blocks become code."""
+"""Makes the docstrings Markdown: roles become links, tables of restructured text and literal blocks become code.
+
+Structures of arrays get a table of what is declared of their fields.
+"""
 
 from __future__ import annotations
 
+import importlib
 import re
 from typing import Any
 
 import griffe
+
+from rl2grid.structures import describe
 
 _ROLE = re.compile(r":(?:func|class|mod|meth|data|attr):`~?([^`]+)`")
 _TABLE = re.compile(r"^=+ [= ]+$\n.*^=+ [= ]+$", re.MULTILINE | re.DOTALL)
@@ -24,8 +30,21 @@ class MarkdownDocstrings(griffe.Extension):
             return
         if node.docstring is not None:
             node.docstring.value = _markdown(node.docstring.value, node, package)
+            if _is_structure(node):
+                node.docstring.value += f"\n\n{describe(_imported(node))}\n"
         for member in node.members.values():
             self._rewrite(member, package)
+
+
+def _is_structure(node: Any) -> bool:
+    """Whether the fields of a class are declared (:mod:`rl2grid.structures`)."""
+    if not node.is_class or "NamedTuple" not in map(str, node.bases):
+        return False
+    return any(str(member.annotation).startswith("Annotated[") for member in node.attributes.values())
+
+
+def _imported(node: Any) -> Any:
+    return getattr(importlib.import_module(node.module.path), node.name)
 
 
 def _markdown(text: str, node: Any, package: griffe.Module) -> str:
