@@ -46,3 +46,5 @@ def test_grids_have_pictures_and_the_reference_their_docstrings(site):
     rewards = (site / "reference/rl2grid/mdp/rewards.html").read_text(encoding="utf-8")
     assert "staying alive is never punished" in rewards
     assert 'href="state.html#rl2grid.mdp.state.GridState"' in rewards
+    state = (site / "reference/rl2grid/mdp/state.html").read_text(encoding="utf-8")
+    assert "busbar of each element, -1 when disconnected" in state
