@@ -12,8 +12,9 @@ import time
 from pathlib import Path
 from typing import Any
 
+from rl2grid.algorithms.registry import find_algorithm
 from rl2grid.records.files import write_json
-from rl2grid.training.runs import ALGORITHMS, RunArgs, hyperparameters, make_envs
+from rl2grid.training.runs import RunArgs, hyperparameters, make_envs
 
 RESULTS = Path(__file__).resolve().parent / "results" / "loop_speed.json"
 LOOPS: tuple[tuple[str, str, str | None], ...] = (
@@ -37,7 +38,7 @@ def measure(algorithm: str, task: str, heuristic: str | None, seconds: float) ->
     """Rates of one loop with its default hyperparameters."""
     chosen = hyperparameters(algorithm, task, total_timesteps=100_000_000, num_envs=NUM_ENVS, **_small(algorithm))
     envs = make_envs(RunArgs(task, chosen, algorithm, env_keywords={"heuristic": heuristic}, num_threads=1))
-    trainer = ALGORITHMS[algorithm].trainer(chosen, envs)
+    trainer = find_algorithm(algorithm).trainer(chosen, envs)
     # The off-policy algorithms play before they learn.
     while trainer.decisions <= getattr(chosen, "learning_starts", 0):
         trainer.iterate()

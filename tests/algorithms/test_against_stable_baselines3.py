@@ -218,7 +218,7 @@ def test_ppo_probabilities_entropies_and_values(seed: int, continuous: bool):
 def test_ppo_advantages_whatever_ends_the_episodes(seed: int, continuous: bool):
     """The scripts do not depend on actions: both see the same terminations and truncations, and bootstrap alike."""
     ours, theirs = ppo_pair(seed, continuous=continuous)
-    ours._observations, _ = ours.envs.reset()
+    ours.observations, _ = ours.envs.reset()
     rollout, _ = ours.collect()
     assert 5 < int(rollout.ended.sum()) < NUM_ENVS * NUM_STEPS / 2
     assert 1 < int((rollout.ended & (rollout.next_values == 0.0)).sum()) < int(rollout.ended.sum())

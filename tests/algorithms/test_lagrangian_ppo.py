@@ -65,7 +65,7 @@ def trainer(continuous: bool = False, **changes: Any) -> LagrangianPPO:
 
 def first_rollout(learner: LagrangianPPO) -> Rollout:
     """The rollout before any update."""
-    learner._observations, _ = learner.envs.reset(seed=7)
+    learner.observations, _ = learner.envs.reset(seed=7)
     return learner.collect()[0]
 
 

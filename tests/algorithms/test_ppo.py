@@ -54,7 +54,7 @@ def trainer(continuous: bool = False, *, gamma: float | None = 0.9, **changes: A
 
 def first_rollout(ppo: PPO) -> Rollout:
     """The rollout before any update."""
-    ppo._observations, _ = ppo.envs.reset(seed=7)
+    ppo.observations, _ = ppo.envs.reset(seed=7)
     return ppo.collect()[0]
 
 

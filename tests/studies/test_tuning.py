@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 
 import rl2grid
+from rl2grid.algorithms.registry import algorithm_names, find_algorithm
 from rl2grid.errors import UsageError
 from rl2grid.studies import tuning as tuning_module
 from rl2grid.studies.tuning import (
@@ -30,7 +31,6 @@ from rl2grid.studies.tuning import (
     work,
 )
 from rl2grid.training import runs
-from rl2grid.training.runs import ALGORITHMS
 
 SOURCES = str(Path(rl2grid.__file__).parents[1])
 SEARCH: dict[str, Any] = {"name": "search", "algorithm": "ppo", "task": "bus14-T0", "budget": 512, "trials": 2}
@@ -67,9 +67,9 @@ def test_a_bad_search_is_refused_in_one_sentence(changes: dict[str, Any], part: 
     assert part in str(refusal.value)
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.parametrize("algorithm", algorithm_names())
 def test_every_choice_of_every_default_space_can_be_trained(algorithm: str):
-    task = "bus14-T0-TLO" if "T" in ALGORITHMS[algorithm].kinds else "bus14-R"
+    task = "bus14-T0-TLO" if "T" in find_algorithm(algorithm).kinds else "bus14-R"
     tuning = parse_tuning({**SEARCH, "algorithm": algorithm, "task": task, "budget": 100_000})
     for name, values in tuning.space.items():
         for value in values:

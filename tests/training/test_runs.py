@@ -25,7 +25,6 @@ from rl2grid.algorithms.checkpoint import load_checkpoint, save_checkpoint
 from rl2grid.algorithms.policy_agent import PolicyAgent, load_agent
 from rl2grid.algorithms.ppo import Args
 from rl2grid.errors import UsageError
-from rl2grid.training import runs
 from rl2grid.training.runs import RunArgs, find_limits, hyperparameters, is_finished, read_config, resume, train
 
 SMALL = Args(
@@ -249,9 +248,7 @@ def test_requests_that_cannot_be_met_leave_nothing_behind(tmp_path: Path, change
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_algorithm_that_cannot_learn_the_task_is_refused(monkeypatch: pytest.MonkeyPatch):
-    continuous_only = replace(runs.ALGORITHMS["ppo"], kinds=("R",))
-    monkeypatch.setitem(runs.ALGORITHMS, "td3", continuous_only)
+def test_an_algorithm_that_cannot_learn_the_task_is_refused():
     with pytest.raises(UsageError, match=r"'td3' cannot learn .*, which has discrete actions: choose one of ppo"):
         hyperparameters("td3", "bus14-T0")
 
@@ -383,6 +380,7 @@ from pathlib import Path
 import torch
 from test_runs import falling, request, toy_envs
 from rl2grid.algorithms import checkpoint, metrics
+from rl2grid.algorithms.registry import find_algorithm
 from rl2grid.training import runs
 
 folder, kill = Path(sys.argv[1]), sys.argv[2]
@@ -431,12 +429,12 @@ torch.save = save
 checkpoint.os.replace = replace
 metrics.MetricsWriter.__init__ = writer
 # Iterations as long as those of a small task, for the kills from outside.
-iterate = runs.ALGORITHMS["ppo"].trainer.iterate
+iterate = find_algorithm("ppo").trainer.iterate
 def slow(self):
     import time
     time.sleep(0.02)
     return iterate(self)
-runs.ALGORITHMS["ppo"].trainer.iterate = slow
+find_algorithm("ppo").trainer.iterate = slow
 print("ready", flush=True)
 if folder.exists():
     runs.resume(folder, evaluate=falling, make_envs=toy_envs)

@@ -45,6 +45,7 @@ from rl2grid.algorithms.off_policy import (
     make_network,
     random_legal_actions,
 )
+from rl2grid.algorithms.registry import Algorithm
 from rl2grid.errors import UsageError, one_of
 
 SINGLE, DUELING = "single", "dueling"
@@ -319,3 +320,6 @@ class DQN(OffPolicyTrainer):
         """See :class:`OffPolicyTrainer`."""
         super().load_state_dict(state)
         self._renewals = state["renewals"]
+
+
+ALGORITHM = Algorithm("dqn", Args, DQN, ("T",), preset, load_policy, SEARCH_SPACE)

@@ -58,6 +58,7 @@ from rl2grid.algorithms.hyperparameters import changed_preset
 from rl2grid.algorithms.on_policy import ActorCritic, generalized_advantages, values_that_follow
 from rl2grid.algorithms.on_policy import load_policy as load_policy
 from rl2grid.algorithms.playing import Tally, reported
+from rl2grid.algorithms.registry import Algorithm
 from rl2grid.algorithms.trainer import Played
 from rl2grid.errors import UsageError, one_of
 from rl2grid.mdp.constraints import THRESHOLDS
@@ -265,7 +266,7 @@ class LagrangianPPO(ppo.PPO):
         rollout, metrics = super().collect()
         assert isinstance(rollout, Rollout)
         with torch.no_grad():
-            last_values = self.network.cost_values(self._tensor(self._observations, torch.float32))
+            last_values = self.network.cost_values(self.tensor(self.observations, torch.float32))
         following = values_that_follow(
             rollout.cost_values, last_values, rollout.next_cost_values, rollout.ended.unsqueeze(-1)
         )
@@ -280,12 +281,12 @@ class LagrangianPPO(ppo.PPO):
         with torch.no_grad():
             cost_values = self.network.cost_values(step.observations)
             if played.completed.any():
-                last = self._tensor(np.stack(played.last_observations()), torch.float32)
-                at_ends[self._tensor(played.completed)] = self.network.cost_values(last)
+                last = self.tensor(np.stack(played.last_observations()), torch.float32)
+                at_ends[self.tensor(played.completed)] = self.network.cost_values(last)
         with_costs = Rollout(
             **vars(step),
-            costs=self._tensor(costs * self.cost_scale, torch.float32),
-            cost_discounts=self._tensor(self.cost_gamma**played.n_steps, torch.float32),
+            costs=self.tensor(costs * self.cost_scale, torch.float32),
+            cost_discounts=self.tensor(self.cost_gamma**played.n_steps, torch.float32),
             cost_values=cost_values,
             next_cost_values=at_ends,
         )
@@ -296,7 +297,7 @@ class LagrangianPPO(ppo.PPO):
         assert isinstance(rollout, Rollout)
         of_ppo = super().transitions(rollout)
         cost_advantages = advantages_of_costs(rollout, self.args.gae_lambda)
-        multipliers = self._tensor(self.multipliers.current, torch.float32)
+        multipliers = self.tensor(self.multipliers.current, torch.float32)
         advantages = lagrangian_advantages(of_ppo.advantages, cost_advantages.flatten(0, 1), multipliers)
         return Minibatch(
             **{**vars(of_ppo), "advantages": advantages},
@@ -418,3 +419,6 @@ def costs_of_transition(played: Played, constraints: tuple[str, ...]) -> NDArray
     if np.isnan(costs).any():
         raise UsageError(f"The environment does not report info['costs'] of {', '.join(constraints)}.")
     return costs
+
+
+ALGORITHM = Algorithm("lagrangian-ppo", Args, LagrangianPPO, ("T", "R"), preset, load_policy, SEARCH_SPACE, find_limits)

@@ -226,8 +226,8 @@ class OffPolicyTrainer(Trainer):
 
     def iterate(self) -> dict[str, float]:
         """Play ``num_steps`` decisions in every environment, learning on the way, and return the metrics."""
-        if self._observations is None:
-            self._see(self._reset())
+        if self.observations is None:
+            self._see(self.reset())
         tally, history = Tally(), _History()
         for _ in range(self.args.num_steps):
             self._play(tally)
@@ -247,13 +247,13 @@ class OffPolicyTrainer(Trainer):
         drawn = self.memory.draw(self.args.batch_size)
         actions = torch.as_tensor(drawn.actions)
         return Batch(
-            self._tensor(self._normalized(drawn.observations)),
-            None if drawn.masks is None else self._tensor(drawn.masks),
+            self.tensor(self._normalized(drawn.observations)),
+            None if drawn.masks is None else self.tensor(drawn.masks),
             (actions if self.continuous else actions.to(torch.int64)).to(self.device),
-            self._tensor(drawn.rewards),
-            self._tensor(drawn.discounts),
-            self._tensor(self._normalized(drawn.next_observations)),
-            None if drawn.next_masks is None else self._tensor(drawn.next_masks),
+            self.tensor(drawn.rewards),
+            self.tensor(drawn.discounts),
+            self.tensor(self._normalized(drawn.next_observations)),
+            None if drawn.next_masks is None else self.tensor(drawn.next_masks),
         )
 
     def normalizer_state(self) -> dict[str, Any] | None:
@@ -285,20 +285,20 @@ class OffPolicyTrainer(Trainer):
     def _see(self, observations: NDArray[np.float32]) -> None:
         """Take over what the environments show: each observation enters the statistics once."""
         # A copy, because environments may reuse their buffers.
-        self._observations = np.array(observations, np.float32)
+        self.observations = np.array(observations, np.float32)
         if self.normalizer is not None:
-            self.normalizer.update(self._observations)
+            self.normalizer.update(self.observations)
 
     def _play(self, tally: Tally) -> None:
         """One decision in every environment, remembered."""
-        args, observations = self.args, self._observations
+        args, observations = self.args, self.observations
         assert observations is not None
         masks = self.envs.action_masks() if args.mask_actions else None  # type: ignore[attr-defined]
         with torch.no_grad():
             actions = self.explore(
-                self._tensor(self._normalized(observations)), None if masks is None else torch.as_tensor(masks)
+                self.tensor(self._normalized(observations)), None if masks is None else torch.as_tensor(masks)
             ).cpu()
-        played = self._step(actions.numpy(), tally)
+        played = self.step(actions.numpy(), tally)
         ended_well = np.flatnonzero(played.completed).tolist()
         self.memory.add(
             Step(

@@ -370,8 +370,8 @@ class OnPolicyTrainer(Trainer):
 
     def iterate(self) -> dict[str, float]:
         """Play ``num_steps`` decisions in every environment, learn from them, and return the metrics."""
-        if self._observations is None:
-            self._observations = self._reset()
+        if self.observations is None:
+            self.observations = self.reset()
         rollout, metrics = self.collect()
         metrics["charts/grid_steps"] = float(self.grid_steps)
         metrics |= self.before_update()
@@ -387,37 +387,37 @@ class OnPolicyTrainer(Trainer):
         steps = [self._play(tally)[0] for _ in range(self.args.num_steps)]
         rollout = type(steps[0]).stack(steps)
         with torch.no_grad():
-            last_values = self.network.value(self._tensor(self._observations, torch.float32))
+            last_values = self.network.value(self.tensor(self.observations, torch.float32))
         following = values_that_follow(rollout.values, last_values, rollout.next_values, rollout.ended)
         return replace(rollout, next_values=following), tally.metrics()
 
     def _play(self, tally: Tally) -> tuple[Rollout, Played]:
         """One decision in every environment: a step of a rollout, its ``next_values`` known where episodes ended."""
         args, network = self.args, self.network
-        observations = self._tensor(self._observations, torch.float32)
-        masks = self._tensor(self.envs.action_masks()) if args.mask_actions else None  # type: ignore[attr-defined]
+        observations = self.tensor(self.observations, torch.float32)
+        masks = self.tensor(self.envs.action_masks()) if args.mask_actions else None  # type: ignore[attr-defined]
         with torch.no_grad():
             actions = network.act(observations, masks, self.generator)
             log_probabilities, _ = network.log_probability_and_entropy(observations, actions, masks)
             values = network.value(observations)
-        played = self._step(self._playable(actions), tally)
-        self._observations = played.observations
+        played = self.step(self._playable(actions), tally)
+        self.observations = played.observations
         at_ends = torch.zeros(args.num_envs, device=self.device)
         if played.completed.any():
             with torch.no_grad():
-                last = self._tensor(np.stack(played.last_observations()), torch.float32)
-                at_ends[self._tensor(played.completed)] = network.value(last)
+                last = self.tensor(np.stack(played.last_observations()), torch.float32)
+                at_ends[self.tensor(played.completed)] = network.value(last)
         step = Rollout(
             observations,
             masks,
             actions,
             log_probabilities,
-            rewards=self._tensor(played.rewards * self.reward_scale, torch.float32),
-            discounts=self._tensor(args.gamma**played.n_steps, torch.float32),
+            rewards=self.tensor(played.rewards * self.reward_scale, torch.float32),
+            discounts=self.tensor(args.gamma**played.n_steps, torch.float32),
             values=values,
             next_values=at_ends,
-            ended=self._tensor(played.ended),
-            decided=self._tensor(played.decided),
+            ended=self.tensor(played.ended),
+            decided=self.tensor(played.decided),
         )
         return step, played
 

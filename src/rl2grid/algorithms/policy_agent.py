@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,8 @@ import numpy as np
 import torch
 
 from rl2grid.agents.agent import Action, Info, Observation
-from rl2grid.algorithms import dqn, lagrangian_ppo, ppo, sac, td3
 from rl2grid.algorithms.checkpoint import load_checkpoint
+from rl2grid.algorithms.registry import find_algorithm
 from rl2grid.envs.normalization import ObservationNormalizer
 from rl2grid.envs.tasks import find_task
 from rl2grid.errors import UsageError
@@ -23,14 +23,6 @@ BEST_FILE = "best.pt"
 """In a run folder: the policy with the highest validation survival so far."""
 CHECKPOINT_FILE = "checkpoint.pt"
 """In a run folder: everything needed to go on."""
-
-_NETWORKS: dict[str, Callable[[Mapping[str, Any]], Any]] = {
-    "ppo": ppo.load_policy,
-    "lagrangian-ppo": lagrangian_ppo.load_policy,
-    "dqn": dqn.load_policy,
-    "sac": sac.load_policy,
-    "td3": td3.load_policy,
-}
 
 
 class PolicyAgent:
@@ -51,7 +43,7 @@ class PolicyAgent:
         """Keywords of the environments that it was trained in: play it with the same ``heuristic`` and
         ``normalize``, unless the difference is what is studied."""
         self.deterministic = deterministic
-        self._network = _NETWORKS[contents["algorithm"]](policy)
+        self._network = find_algorithm(contents["algorithm"]).load_policy(policy)
         self._mask_actions = bool(policy["mask_actions"])
         self._normalizer: ObservationNormalizer | None = None
         if policy["normalizer"] is not None:

@@ -32,6 +32,7 @@ from rl2grid.algorithms.on_policy import (
     advantages_of_rewards,
 )
 from rl2grid.algorithms.on_policy import load_policy as load_policy
+from rl2grid.algorithms.registry import Algorithm
 
 # --- Hyperparameters ------------------------------------------------------------------------------------------------
 
@@ -211,3 +212,6 @@ class PPO(OnPolicyTrainer):
     def losses(self, batch: Minibatch) -> Losses:
         """See :func:`losses`."""
         return losses(self.network, batch, self.args)
+
+
+ALGORITHM = Algorithm("ppo", Args, PPO, ("T", "R"), preset, load_policy, SEARCH_SPACE)

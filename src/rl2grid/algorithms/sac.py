@@ -56,6 +56,7 @@ from rl2grid.algorithms.off_policy import (
     make_network,
     random_legal_actions,
 )
+from rl2grid.algorithms.registry import Algorithm
 
 # --- Hyperparameters ------------------------------------------------------------------------------------------------
 
@@ -492,3 +493,6 @@ class SAC(OffPolicyTrainer):
     def policy(self) -> tuple[nn.Module, dict[str, Any]]:
         """See :class:`OffPolicyTrainer`."""
         return self.actor, {"actor_layers": list(self.args.actor_layers)}
+
+
+ALGORITHM = Algorithm("sac", Args, SAC, ("T", "R"), preset, load_policy, SEARCH_SPACE)

@@ -37,6 +37,7 @@ from rl2grid.algorithms.off_policy import (
     follow,
     make_network,
 )
+from rl2grid.algorithms.registry import Algorithm
 from rl2grid.errors import UsageError
 
 # --- Hyperparameters ------------------------------------------------------------------------------------------------
@@ -266,3 +267,6 @@ class TD3(OffPolicyTrainer):
     def policy(self) -> tuple[nn.Module, dict[str, Any]]:
         """See :class:`OffPolicyTrainer`."""
         return self.actor, {"actor_layers": list(self.args.actor_layers)}
+
+
+ALGORITHM = Algorithm("td3", Args, TD3, ("R",), preset, load_policy, SEARCH_SPACE)

@@ -19,6 +19,7 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -91,7 +92,7 @@ class Trainer(ABC):
         """Decisions made so far, over all environments."""
         self.grid_steps = 0
         """Grid steps behind them."""
-        self._observations: NDArray[np.float32] | None = None
+        self.observations: NDArray[np.float32] | None = None
         self._over = np.zeros(args.num_envs, np.bool_)
         self._episode_return = np.zeros(args.num_envs, np.float64)
         self._episode_length = np.zeros(args.num_envs, np.int64)
@@ -100,6 +101,10 @@ class Trainer(ABC):
     def finished(self) -> bool:
         """Whether the budget of decisions is used up."""
         return self.iteration >= self.num_iterations
+
+    def store_in(self, folder: Path) -> None:
+        """Where files may be kept that ``state_dict`` only refers to, before the first iteration; most need none."""
+        return
 
     @abstractmethod
     def iterate(self) -> dict[str, float]:
@@ -138,7 +143,7 @@ class Trainer(ABC):
             "iteration": self.iteration,
             "decisions": self.decisions,
             "grid_steps": self.grid_steps,
-            "observations": np.array(self._observations),
+            "observations": np.array(self.observations),
             "over": self._over,
             "episode_return": self._episode_return,
             "episode_length": self._episode_length,
@@ -156,20 +161,20 @@ class Trainer(ABC):
         self.generator.set_state(state["generator"])
         self.iteration, self.decisions = state["iteration"], state["decisions"]
         self.grid_steps = state["grid_steps"]
-        self._observations = np.array(state["observations"])
+        self.observations = np.array(state["observations"])
         self._over = np.array(state["over"])
         self._episode_return = np.array(state["episode_return"])
         self._episode_length = np.array(state["episode_length"])
-        resume_environments(self.envs, state["envs"], self._observations)
+        resume_environments(self.envs, state["envs"], self.observations)
 
-    def _reset(self) -> NDArray[np.float32]:
+    def reset(self) -> NDArray[np.float32]:
         """Begin the first episodes; what they show."""
         observations: NDArray[np.float32]
         observations, infos = self.envs.reset(seed=self.args.seed * self.args.num_envs)
         self._over = reported(infos, "over", np.zeros(self.args.num_envs, np.bool_))
         return observations
 
-    def _step(self, actions: NDArray[Any], tally: Tally) -> Played:
+    def step(self, actions: NDArray[Any], tally: Tally) -> Played:
         """Play a decision in every environment and count it.
 
         Raises:
@@ -198,6 +203,6 @@ class Trainer(ABC):
         self._episode_length[ended] = 0
         return Played(observations, discounted, n_steps, ended, terminated, truncated & ~terminated, decided, infos)
 
-    def _tensor(self, values: Any, dtype: torch.dtype | None = None) -> Tensor:
+    def tensor(self, values: Any, dtype: torch.dtype | None = None) -> Tensor:
         """A copy of an array on the networks' device."""
         return torch.tensor(values, dtype=dtype, device=self.device)

@@ -10,25 +10,26 @@ from dataclasses import Field, asdict, dataclass, field, fields, make_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
+from rl2grid.algorithms.registry import algorithm_names
 from rl2grid.cli.keywords import flag_text, reward_of
 from rl2grid.envs.options import TaskOptions, options_of, options_without
 from rl2grid.envs.tasks import find_task
-from rl2grid.errors import UsageError, one_of
+from rl2grid.errors import UsageError
 from rl2grid.training.limits import TimeLimit
 
 if TYPE_CHECKING:
-    from rl2grid.training.runs import Hyperparameters
+    from rl2grid.algorithms.registry import Hyperparameters
 
 GIVEN_OTHERWISE = ("split", "gamma")
 """Keywords that a training decides itself."""
 INTERRUPTED = 130
 """Exit status after an interrupt, as shells have it."""
 
-_HELP = """\
+_HELP = f"""\
 usage: rl2grid train <algorithm> <task> [flags]
        rl2grid train --resume <run folder> [--max-minutes <minutes>]
 
-Trains an algorithm (ppo, lagrangian-ppo, dqn, sac, td3) on a task (see `rl2grid tasks`) and writes a run folder:
+Trains an algorithm ({", ".join(algorithm_names())}) on a task (see `rl2grid tasks`) and writes a run folder:
 configuration, metrics.csv, tensorboard/, checkpoint.pt, best.pt by validation, log.txt. A run that was
 interrupted goes on with --resume. Flags and their defaults with --help after the task, for example
 `rl2grid train ppo bus14-T0 --help`.
@@ -108,11 +109,8 @@ def _begin(algorithm: str, task_id: str, flags: list[str]) -> int:
         from rl2grid.training.validation import find_validator
     except ImportError as error:
         raise UsageError(f"Training needs {error.name}: install it with `pip install rl2grid[train]`.") from None
-    if algorithm not in runs.ALGORITHMS:
-        raise one_of("Algorithm", algorithm, tuple(runs.ALGORITHMS))
-    chosen = runs.ALGORITHMS[algorithm]
     hyperparameters = runs.hyperparameters(algorithm, task.id, _preset(flags))
-    _refuse_unknown(flags, [*fields(TrainFlags), *options_without(*GIVEN_OTHERWISE), *fields(chosen.args)])
+    _refuse_unknown(flags, [*fields(TrainFlags), *options_without(*GIVEN_OTHERWISE), *fields(hyperparameters)])
     own, keywords, hyperparameters = _parse_all(f"rl2grid train {algorithm} {task.id}", flags, hyperparameters)
     limit = TimeLimit(own.max_minutes)
     keywords["reward"] = reward_of(keywords["reward"])

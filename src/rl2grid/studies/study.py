@@ -29,6 +29,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from rl2grid.algorithms.registry import Hyperparameters, algorithm_names, find_algorithm
 from rl2grid.engines import HEURISTICS
 from rl2grid.envs.options import TaskOptions
 from rl2grid.envs.tasks import constraint_of, find_task
@@ -76,7 +77,7 @@ class Training:
     validations: int
     """Evaluations on the validation scenarios, spread evenly over the budget."""
 
-    def resolved(self, task: str) -> runs.Hyperparameters:
+    def resolved(self, task: str) -> Hyperparameters:
         """All hyperparameters.
 
         Raises:
@@ -222,7 +223,7 @@ class _Group:
 
     def cells(self) -> Iterator[Cell]:
         """The product of what the group lists."""
-        algorithms, agents = self._names("algorithms", runs.ALGORITHMS), self._names("agents", AGENTS)
+        algorithms, agents = self._names("algorithms", algorithm_names()), self._names("agents", AGENTS)
         tasks = [find_task(task).id for task in self._names("tasks")]
         heuristics = self._names("heuristics", (NO_HEURISTIC, *HEURISTICS)) or [NO_HEURISTIC]
         if not tasks or not (algorithms or agents):
@@ -274,18 +275,18 @@ class _Group:
     def _changes(self, algorithm: str) -> dict[str, Any]:
         """Hyperparameters of the group: those of all its algorithms, then those of this one."""
         table = table_of(self.where, self.table, "hyperparameters")
-        common = {name: value for name, value in table.items() if name not in runs.ALGORITHMS}
+        common = {name: value for name, value in table.items() if name not in algorithm_names()}
         merged = {**common, **as_table(f"{self.where}, hyperparameters.{algorithm}", table.get(algorithm, {}))}
         return with_tuples(merged)
 
     def _check_hyperparameters(self, algorithms: Sequence[str]) -> None:
         for name, value in table_of(self.where, self.table, "hyperparameters").items():
-            if name in runs.ALGORITHMS and name not in algorithms:
+            if name in algorithm_names() and name not in algorithms:
                 raise UsageError(f"{upper(self.where)} has hyperparameters of {name}, which it does not train.")
-            if isinstance(value, dict) and name not in runs.ALGORITHMS:
+            if isinstance(value, dict) and name not in algorithm_names():
                 raise unknown(f"{upper(self.where)}: hyperparameters of", name, algorithms)
         for algorithm in algorithms:
-            known = runs.kinds_of_hyperparameters(algorithm)
+            known = find_algorithm(algorithm).type_hints()
             for name, value in self._changes(algorithm).items():
                 if name in ("seed", "total_timesteps"):
                     key = {"seed": "seeds", "total_timesteps": "budget"}[name]

@@ -24,7 +24,6 @@ import time
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +33,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from rl2grid.algorithms.policy_agent import PolicyAgent
+from rl2grid.algorithms.registry import Hyperparameters, algorithm_names, find_algorithm
 from rl2grid.engines import HEURISTICS
 from rl2grid.envs.tasks import find_task
 from rl2grid.errors import UsageError
@@ -99,7 +99,7 @@ class Tuning:
     space: Mapping[str, Any]
     """By hyperparameter: a list of choices, or ``{"low": ..., "high": ..., "log": ...}``."""
 
-    def resolved(self, chosen: Mapping[str, Any]) -> runs.Hyperparameters:
+    def resolved(self, chosen: Mapping[str, Any]) -> Hyperparameters:
         """All hyperparameters of a trial.
 
         Raises:
@@ -149,8 +149,8 @@ def parse_tuning(contents: Mapping[str, Any], output: Path | None = None) -> Tun
     heuristic = text(where, contents, "heuristic", NO_HEURISTIC)
     if heuristic not in (NO_HEURISTIC, *HEURISTICS):
         raise unknown("Heuristic", heuristic, (NO_HEURISTIC, *HEURISTICS))
-    if algorithm not in runs.ALGORITHMS:
-        raise unknown("Algorithm", algorithm, tuple(runs.ALGORITHMS))
+    if algorithm not in algorithm_names():
+        raise unknown("Algorithm", algorithm, algorithm_names())
     hyperparameters = as_table("the search, hyperparameters", contents.get("hyperparameters", {}))
     space = as_table("the search, space", contents.get("space", _default_space(algorithm, hyperparameters)))
     months = contents.get("months")
@@ -179,8 +179,7 @@ def parse_tuning(contents: Mapping[str, Any], output: Path | None = None) -> Tun
 
 def search_space(algorithm: str) -> dict[str, list[Any]]:
     """The paper's grid for an algorithm (its table of hyperparameters)."""
-    module = import_module(runs.ALGORITHMS[algorithm].args.__module__)
-    return {name: list(values) for name, values in module.SEARCH_SPACE.items()}
+    return {name: list(values) for name, values in find_algorithm(algorithm).search_space.items()}
 
 
 def _default_space(algorithm: str, fixed: Mapping[str, Any]) -> dict[str, list[Any]]:
@@ -317,7 +316,7 @@ def _was_pruned(study: Any, folder: Path) -> bool:
     return any(trial.user_attrs.get("run") == folder.name for trial in pruned)
 
 
-def _run_args(tuning: Tuning, hyperparameters: runs.Hyperparameters, folder: Path | None) -> runs.RunArgs:
+def _run_args(tuning: Tuning, hyperparameters: Hyperparameters, folder: Path | None) -> runs.RunArgs:
     return runs.RunArgs(
         task=tuning.task,
         hyperparameters=hyperparameters,
@@ -485,7 +484,7 @@ def _check_space(tuning: Tuning) -> None:
 
 def _kinds(tuning: Tuning) -> dict[str, Any]:
     """Type hint of every name that a search may hold."""
-    return {**runs.kinds_of_hyperparameters(tuning.algorithm), TRANSITIONS: int}
+    return {**find_algorithm(tuning.algorithm).type_hints(), TRANSITIONS: int}
 
 
 def _choices(name: str, values: Any) -> list[Any]:

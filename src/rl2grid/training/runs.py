@@ -26,17 +26,23 @@ from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, field, fields, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Protocol, get_type_hints
+from typing import Any
 
 import gymnasium
 from filelock import FileLock, Timeout
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from rl2grid.algorithms import dqn, lagrangian_ppo, ppo, sac, td3
 from rl2grid.algorithms.checkpoint import load_checkpoint, save_checkpoint
 from rl2grid.algorithms.metrics import MetricsWriter
-from rl2grid.algorithms.off_policy import OffPolicyTrainer
 from rl2grid.algorithms.policy_agent import BEST_FILE, CHECKPOINT_FILE, PolicyAgent
+from rl2grid.algorithms.registry import (
+    Algorithm,
+    Hyperparameters,
+    VectorEnvironment,
+    algorithms_for,
+    find_algorithm,
+)
+from rl2grid.algorithms.trainer import Trainer
 from rl2grid.envs.options import TaskOptions
 from rl2grid.envs.registration import register_all
 from rl2grid.envs.tasks import CONSTRAINTS, Task, constraint_of, find_task
@@ -60,58 +66,9 @@ REPLAY_FOLDER = "replay"
 
 UNLIMITED = TimeLimit(None)
 
-VectorEnvironment = gymnasium.vector.VectorEnv[Any, Any, Any]
 Evaluate = Callable[[PolicyAgent], Mapping[str, float]]
 """Plays the validation scenarios and returns means over them: ``survival``, under constraints also
 ``safe_completed``, and whatever else is to be recorded."""
-Hyperparameters = ppo.Args | lagrangian_ppo.Args | dqn.Args | sac.Args | td3.Args
-
-
-class Trainer(Protocol):
-    """What a run needs of an algorithm in progress."""
-
-    num_iterations: int
-    decisions: int
-    grid_steps: int
-
-    @property
-    def finished(self) -> bool:
-        """Whether the budget of decisions is used up."""
-
-    def iterate(self) -> dict[str, float]:
-        """Play ``num_steps`` decisions in every environment, learn, and return the metrics."""
-
-    def policy_state(self) -> dict[str, Any]:
-        """All that is needed to act."""
-
-    def state_dict(self) -> dict[str, Any]:
-        """All that is needed to go on, after an iteration."""
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on where ``state_dict`` was called, bit for bit."""
-
-
-@dataclass(frozen=True)
-class Algorithm:
-    """What a run needs to know of an algorithm."""
-
-    args: type[Hyperparameters]
-    """Its hyperparameters."""
-    trainer: Callable[[Any, VectorEnvironment], Trainer]
-    """Made of hyperparameters and environments."""
-    kinds: tuple[str, ...]
-    """Kinds of task that it can learn: ``"T"`` (discrete actions), ``"R"`` (continuous actions)."""
-    preset: Callable[..., Hyperparameters]
-    """``preset(name, continuous=..., **changes)``."""
-
-
-ALGORITHMS: dict[str, Algorithm] = {
-    "ppo": Algorithm(ppo.Args, ppo.PPO, ("T", "R"), ppo.preset),
-    "lagrangian-ppo": Algorithm(lagrangian_ppo.Args, lagrangian_ppo.LagrangianPPO, ("T", "R"), lagrangian_ppo.preset),
-    "dqn": Algorithm(dqn.Args, dqn.DQN, ("T",), dqn.preset),
-    "sac": Algorithm(sac.Args, sac.SAC, ("T", "R"), sac.preset),
-    "td3": Algorithm(td3.Args, td3.TD3, ("R",), td3.preset),
-}
 
 
 @dataclass(frozen=True)
@@ -157,28 +114,23 @@ def hyperparameters(algorithm: str, task: str, preset: str = "default", **change
     for name in changes:
         if name not in known:
             raise one_of(f"Hyperparameter of {algorithm}", name, known)
-    return chosen.preset(preset, continuous=find_task(task).kind == "R", **changes)
-
-
-def kinds_of_hyperparameters(algorithm: str) -> dict[str, Any]:
-    """Type hint of every hyperparameter of an algorithm."""
-    args = ALGORITHMS[algorithm].args
-    hints = get_type_hints(args)
-    return {parameter.name: hints[parameter.name] for parameter in fields(args)}
+    resolved: Hyperparameters = chosen.preset(preset, continuous=find_task(task).kind == "R", **changes)
+    return resolved
 
 
 def find_limits(args: RunArgs) -> dict[str, float]:
     """What the costs of a safe episode may reach, by constraint; empty without a constraint.
 
-    The constraint is the task's, or that of the keyword ``constraint``; Lagrangian PPO may have others of its own.
+    The constraint is the task's, or that of the keyword ``constraint``; an algorithm may have others of its own.
 
     Raises:
         UsageError: Lagrangian PPO without a constraint, or with one whose costs the environments do not report, or a
             keyword that contradicts the task's id.
     """
     constraint = constraint_of(find_task(args.task), args.env_keywords.get("constraint"))
-    if isinstance(args.hyperparameters, lagrangian_ppo.Args):
-        limits = lagrangian_ppo.find_limits(args.hyperparameters, constraint)
+    algorithm = find_algorithm(args.algorithm)
+    if algorithm.find_limits is not None:
+        limits = algorithm.find_limits(args.hyperparameters, constraint)
         for name in limits:
             if name not in CONSTRAINTS:
                 raise one_of("Constraint", name, CONSTRAINTS)
@@ -243,7 +195,7 @@ def train(
         raise UsageError(f"Folder {str(folder)!r} exists already: resume the run in it, or choose another folder.")
     envs = make_envs(args)
     try:
-        trainer = ALGORITHMS[args.algorithm].trainer(args.hyperparameters, envs)
+        trainer = find_algorithm(args.algorithm).trainer(args.hyperparameters, envs)
         identity = _identity(args)
         _create_folder(folder, args, identity)
         with _locked(folder):
@@ -280,7 +232,7 @@ def resume(
             checkpoint = load_checkpoint(folder / CHECKPOINT_FILE, task=args.task)
         envs = make_envs(args)
         try:
-            trainer = ALGORITHMS[args.algorithm].trainer(args.hyperparameters, envs)
+            trainer = find_algorithm(args.algorithm).trainer(args.hyperparameters, envs)
             run = _Run(folder, args, now, trainer, evaluate)
             if identity["versions"] != now["versions"]:
                 run.note(f"library versions differ from those the run began with: {now['versions']}")
@@ -300,7 +252,7 @@ def read_config(folder: Path) -> tuple[RunArgs, dict[str, Any]]:
     try:
         config = json.loads(path.read_text(encoding="utf-8"))
         request = dict(config["request"])
-        algorithm = ALGORITHMS[request["algorithm"]]
+        algorithm = find_algorithm(request["algorithm"])
         request["hyperparameters"] = algorithm.args(**_tuples(request["hyperparameters"]))
         request["env_keywords"] = _tuples(request["env_keywords"])
         return RunArgs(**request, folder=folder), config["identity"]
@@ -402,8 +354,7 @@ class _Run:
 def _run(run: _Run, envs: VectorEnvironment, limit: TimeLimit, checkpoint: Mapping[str, Any] | None) -> None:
     """Train until the budget is used up, a signal asks to stop or the time is up; closes the environments."""
     args, trainer = run.args, run.trainer
-    if isinstance(trainer, OffPolicyTrainer):
-        trainer.store_in(run.folder / REPLAY_FOLDER)
+    trainer.store_in(run.folder / REPLAY_FOLDER)
     if checkpoint is not None:
         run.load(checkpoint)
     run.note(f"{'resumed' if checkpoint else 'started'} at {trainer.decisions} of {_budget(args, trainer)} decisions")
@@ -525,11 +476,9 @@ def _resolved(args: RunArgs) -> RunArgs:
 
 
 def _checked_algorithm(name: str, task: Task) -> Algorithm:
-    if name not in ALGORITHMS:
-        raise one_of("Algorithm", name, tuple(ALGORITHMS))
-    algorithm = ALGORITHMS[name]
+    algorithm = find_algorithm(name)
     if task.kind not in algorithm.kinds:
-        able = [other for other, candidate in ALGORITHMS.items() if task.kind in candidate.kinds]
+        able = algorithms_for(task.kind)
         raise UsageError(
             f"Algorithm {name!r} cannot learn {task.id}, which has {_ACTIONS[task.kind]} actions: "
             f"choose one of {', '.join(able)}."

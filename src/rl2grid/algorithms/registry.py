@@ -1,0 +1,124 @@
+"""The algorithms that can be trained, by name: those of the package and whatever :func:`register_algorithm` adds.
+
+This module needs no PyTorch: the file of an algorithm is imported when it is first asked for, and ends in the
+:class:`Algorithm` that describes it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, get_type_hints
+
+import gymnasium
+
+from rl2grid.errors import UsageError, one_of
+
+if TYPE_CHECKING:
+    from rl2grid.algorithms.trainer import Trainer
+
+VectorEnvironment = gymnasium.vector.VectorEnv[Any, Any, Any]
+
+
+class Hyperparameters(Protocol):
+    """What a run reads of the hyperparameters of any algorithm, a dataclass."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    @property
+    def seed(self) -> int:
+        """Of everything random."""
+
+    @property
+    def total_timesteps(self) -> int:
+        """Decisions to train for, over all environments."""
+
+    @property
+    def num_envs(self) -> int:
+        """Environments played side by side."""
+
+    @property
+    def num_steps(self) -> int:
+        """Decisions per environment and iteration."""
+
+    @property
+    def gamma(self) -> float:
+        """Discount of one grid step."""
+
+
+@dataclass(frozen=True)
+class Algorithm:
+    """What training, evaluation and tuning need to know of an algorithm."""
+
+    name: str
+    """What the command line, run folders and checkpoints call it."""
+    args: type[Any]
+    """Its :class:`Hyperparameters`, a frozen dataclass, such as
+    :class:`~rl2grid.algorithms.hyperparameters.SharedArgs` and what is made of it."""
+    trainer: Callable[[Any, VectorEnvironment], Trainer]
+    """Made of hyperparameters and environments."""
+    kinds: tuple[str, ...]
+    """Kinds of task that it can learn: ``"T"`` (discrete actions), ``"R"`` (continuous actions)."""
+    preset: Callable[..., Any]
+    """``preset(name, continuous=..., **changes)``: hyperparameters."""
+    load_policy: Callable[[Mapping[str, Any]], Any]
+    """The network of a checkpoint's section ``policy``, which acts."""
+    search_space: Mapping[str, tuple[Any, ...]] = field(default_factory=dict)
+    """Values that a search tries by default, by hyperparameter."""
+    find_limits: Callable[[Any, str | None], dict[str, float]] | None = None
+    """Of algorithms with constraints of their own: ``find_limits(args, constraint of the task)`` tells what the costs
+    of a safe episode may reach, by constraint; None: the task's constraint is all there is."""
+
+    def type_hints(self) -> dict[str, Any]:
+        """Type hint of every hyperparameter."""
+        hints = get_type_hints(self.args)
+        return {parameter.name: hints[parameter.name] for parameter in fields(self.args)}
+
+
+_IN_PACKAGE = {
+    "ppo": "rl2grid.algorithms.ppo",
+    "lagrangian-ppo": "rl2grid.algorithms.lagrangian_ppo",
+    "dqn": "rl2grid.algorithms.dqn",
+    "sac": "rl2grid.algorithms.sac",
+    "td3": "rl2grid.algorithms.td3",
+}
+"""The file of each, whose ``ALGORITHM`` describes it."""
+_ADDED: dict[str, Algorithm] = {}
+
+
+def register_algorithm(algorithm: Algorithm) -> None:
+    """Let an algorithm be trained, evaluated, studied and tuned by its name, in this process.
+
+    Raises:
+        UsageError: the name is taken by another algorithm.
+    """
+    if algorithm.name in _IN_PACKAGE or _ADDED.get(algorithm.name, algorithm) != algorithm:
+        raise UsageError(f"Algorithm {algorithm.name!r} exists already: choose another name.")
+    _ADDED[algorithm.name] = algorithm
+
+
+def algorithm_names() -> tuple[str, ...]:
+    """All names, those of the package first."""
+    return (*_IN_PACKAGE, *_ADDED)
+
+
+def find_algorithm(name: str) -> Algorithm:
+    """The algorithm called ``name``.
+
+    Raises:
+        UsageError: there is none.
+        ImportError: PyTorch is not installed.
+    """
+    if name in _ADDED:
+        return _ADDED[name]
+    if name not in _IN_PACKAGE:
+        raise one_of("Algorithm", name, algorithm_names())
+    algorithm = import_module(_IN_PACKAGE[name]).ALGORITHM
+    assert isinstance(algorithm, Algorithm)
+    return algorithm
+
+
+def algorithms_for(kind: str) -> tuple[str, ...]:
+    """Names of the algorithms that can learn tasks of a kind, ``"T"`` or ``"R"``."""
+    return tuple(name for name in algorithm_names() if kind in find_algorithm(name).kinds)

@@ -1,0 +1,93 @@
+"""Algorithms by name, and one of a user's own beside them."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import dataclass, replace
+
+import pytest
+
+from rl2grid.algorithms import registry
+from rl2grid.algorithms.registry import (
+    Algorithm,
+    algorithm_names,
+    algorithms_for,
+    find_algorithm,
+    register_algorithm,
+)
+from rl2grid.errors import UsageError
+from rl2grid.studies.tuning import search_space
+from rl2grid.training.runs import hyperparameters
+
+OURS = ("ppo", "lagrangian-ppo", "dqn", "sac", "td3")
+
+
+@dataclass(frozen=True)
+class Args:
+    """Hyperparameters of nothing."""
+
+    seed: int = 1
+    total_timesteps: int = 10
+    num_envs: int = 1
+    num_steps: int = 1
+    gamma: float = 0.5
+
+
+def preset(name: str, *, continuous: bool, **changes: object) -> Args:
+    assert name == "default"
+    return replace(Args(), **changes)  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def mine(monkeypatch: pytest.MonkeyPatch) -> Algorithm:
+    """An algorithm that is registered during a test."""
+    monkeypatch.setattr(registry, "_ADDED", {})
+    algorithm = Algorithm("mine", Args, lambda args, envs: None, ("R",), preset, lambda state: None, {"gamma": (0.1,)})  # type: ignore[arg-type, return-value]
+    register_algorithm(algorithm)
+    return algorithm
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_each_is_found_by_its_name(name: str):
+    algorithm = find_algorithm(name)
+    assert algorithm.name == name
+    for kind in algorithm.kinds:
+        args = algorithm.preset("default", continuous=kind == "R")
+        assert type(args) is algorithm.args
+    assert algorithm.type_hints().keys() == vars(args).keys()
+    assert algorithm.search_space.keys() - {"num_envs * num_steps"} <= vars(args).keys()
+
+
+def test_kinds_of_tasks_and_names():
+    assert algorithm_names() == OURS
+    assert algorithms_for("T") == ("ppo", "lagrangian-ppo", "dqn", "sac")
+    assert algorithms_for("R") == ("ppo", "lagrangian-ppo", "sac", "td3")
+    with pytest.raises(UsageError, match="'a2c' does not exist: choose one of ppo, lagrangian-ppo, dqn, sac, td3"):
+        find_algorithm("a2c")
+
+
+def test_one_of_a_users_own_stands_beside_them(mine: Algorithm):
+    assert find_algorithm("mine") is mine
+    assert algorithm_names() == (*OURS, "mine")
+    assert algorithms_for("R")[-1] == "mine"
+    assert hyperparameters("mine", "bus14-R", seed=3) == Args(seed=3)
+    assert search_space("mine") == {"gamma": [0.1]}
+    with pytest.raises(UsageError, match=r"'mine' cannot learn .* discrete actions: choose one of ppo, lagrangian-ppo"):
+        hyperparameters("mine", "bus14-T0")
+
+
+def test_names_are_given_once(mine: Algorithm):
+    register_algorithm(mine)  # the same again, as by a module that is read twice
+    with pytest.raises(UsageError, match="'mine' exists already: choose another name"):
+        register_algorithm(replace(mine, kinds=("T",)))
+    with pytest.raises(UsageError, match="'ppo' exists already"):
+        register_algorithm(replace(mine, name="ppo"))
+
+
+def test_names_are_known_without_pytorch():
+    """So that help and refusals are quick, and possible where it is not installed."""
+    code = "import sys; from rl2grid.algorithms.registry import algorithm_names; algorithm_names()"
+    code += "; from rl2grid.cli.train import train; train(['--help']); assert 'torch' not in sys.modules"
+    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert f"({', '.join(OURS)})" in shown
