@@ -14,10 +14,11 @@ import argparse
 import itertools
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rl2grid.algorithms.hyperparameters import identifying
 from rl2grid.algorithms.policy_agent import load_agent
 from rl2grid.envs.tasks import find_task, short_id
 from rl2grid.errors import UsageError
@@ -75,7 +76,7 @@ def _trained(folder: Path) -> Subject:
     configuration = {
         "algorithm": args.algorithm,
         "task": args.task,
-        "hyperparameters": asdict(args.hyperparameters),
+        "hyperparameters": identifying(args.hyperparameters),
         "env_keywords": dict(args.env_keywords),
     }
     policy = load_agent(folder)

@@ -17,6 +17,7 @@ import stable_baselines3
 import torch
 from gymnasium.spaces import Box, Discrete
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from specs import networks
 from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.type_aliases import ReplayBufferSamples, RolloutBufferSamples
@@ -335,13 +336,10 @@ def test_lagrangian_ppo_without_a_price_has_the_losses_of_ppo(seed: int, continu
     batch = minibatch_of(random_rollout(ours, seed))
     costs = torch.randn(len(batch.actions), 2, generator=torch.Generator().manual_seed(seed))
     lagrangian = lagrangian_ppo.ActorCritic(
-        OBSERVATION_SIZE,
-        ACTION_SIZE,
+        networks(OBSERVATION_SIZE, ACTION_SIZE, continuous=continuous),
         n_costs=2,
-        continuous=continuous,
         actor_layers=(8, 8),
         critic_layers=(8,),
-        initial_log_std=0.0,
     )
     lagrangian.load_state_dict(ours.network.state_dict(), strict=False)
     args = lagrangian_ppo.Args(normalize_advantages=False, mask_actions=False, clip_coefficient=0.2)
@@ -426,9 +424,9 @@ def plain_descent(parameters: Iterable[nn.Parameter], rate: float) -> torch.opti
 
 
 def test_slow_copies_move_alike():
-    generator = torch.Generator().manual_seed(0)
-    online, slow = (dqn.QNetwork(4, 2, (8,), generator) for _ in range(2))
-    theirs = dqn.QNetwork(4, 2, (8,))
+    made = networks(4, 2)
+    online, slow = (dqn.QNetwork(made, (8,)) for _ in range(2))
+    theirs = dqn.QNetwork(made, (8,))
     theirs.load_state_dict(slow.state_dict())
     follow(slow, online, 0.3)
     polyak_update(online.parameters(), theirs.parameters(), 0.3)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from specs import networks
 from torch import Tensor
 from toy_grid import ToyGrid
 from toy_tasks import Chain, vector
@@ -27,7 +28,7 @@ class Table(QNetwork):
     """Values as given, whatever is observed."""
 
     def __init__(self, values: list[list[float]]) -> None:
-        super().__init__(1, len(values[0]), ())
+        super().__init__(networks(1, len(values[0])), ())
         self.values = torch.tensor(values)
 
     def forward(self, observations: Tensor) -> Tensor:
@@ -70,7 +71,7 @@ def test_legal_actions_are_best_even_if_their_values_are_very_negative():
 
 
 def test_targets_carry_no_gradient():
-    network = QNetwork(1, 3, (4,), torch.Generator().manual_seed(0))
+    network = QNetwork(networks(1, 3), (4,))
     assert not targets(network, network, batch()).requires_grad
 
 
@@ -83,7 +84,7 @@ def test_losses_by_hand():
 
 
 def test_a_dueling_head_adds_advantages_without_their_mean_to_the_value_of_the_state():
-    network = QNetwork(1, 3, (), torch.Generator().manual_seed(0), head="dueling")
+    network = QNetwork(networks(1, 3), (), head="dueling")
     (layer,) = network.networks[0]
     with torch.no_grad():
         layer.weight[:] = torch.tensor([[1.0], [0.0], [2.0], [4.0]])
@@ -93,7 +94,7 @@ def test_a_dueling_head_adds_advantages_without_their_mean_to_the_value_of_the_s
 
 
 def test_of_several_networks_the_least_value_counts():
-    network = QNetwork(1, 2, (), torch.Generator().manual_seed(0), count=2)
+    network = QNetwork(networks(1, 2), (), count=2)
     with torch.no_grad():
         for (layer,), biases in zip(network.networks, ([1.0, 5.0], [3.0, 2.0]), strict=True):
             layer.weight[:] = 0.0

@@ -13,6 +13,7 @@ import pytest
 import torch
 from constrained_toys import PAYS, Chain, CostlyToyGrid, Lever
 from numpy.typing import NDArray
+from specs import networks
 from torch import Tensor
 from toy_grid import SingleToyGrid, ToyGrid
 
@@ -324,14 +325,11 @@ def test_the_cost_scale_touches_critics_only():
 
 def policy(*, continuous: bool, n_constraints: int = 2) -> ActorCritic:
     network = ActorCritic(
-        4,
-        2 if continuous else 3,
+        networks(4, 2 if continuous else 3, continuous=continuous),
         n_costs=n_constraints,
-        continuous=continuous,
         actor_layers=(8,),
         critic_layers=(8,),
         initial_log_std=0.3,
-        generator=torch.Generator().manual_seed(0),
     )
     with torch.no_grad():
         network.actor[-1].weight.mul_(50.0)  # type: ignore[union-attr, operator]
@@ -379,16 +377,7 @@ class Scripted(ActorCritic):
     """Log-probabilities, entropies and values as given, so that losses can be computed by hand."""
 
     def __init__(self) -> None:
-        super().__init__(
-            1,
-            2,
-            n_costs=1,
-            continuous=False,
-            actor_layers=(),
-            critic_layers=(),
-            initial_log_std=0.0,
-            generator=torch.Generator(),
-        )
+        super().__init__(networks(1, 2), n_costs=1, actor_layers=(), critic_layers=())
         self.log_probabilities = torch.tensor([-1.0 + math.log(ratio) for ratio in RATIOS], requires_grad=True)
         self.values = torch.tensor([0.5, 0.4, 2.0, 0.1], requires_grad=True)
         self.values_of_costs = torch.tensor([[1.0, 5.0], [0.0, 5.0], [3.0, 5.0], [2.0, 5.0]], requires_grad=True)

@@ -13,12 +13,14 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.vector import AutoresetMode
+from specs import networks
 from toy_grid import SingleToyGrid, ToyGrid
 
 from rl2grid.agents.agent import Agent
 from rl2grid.algorithms import dqn, sac, td3
 from rl2grid.algorithms.checkpoint import load_checkpoint, save_checkpoint
-from rl2grid.algorithms.off_policy import OffPolicyTrainer, follow, make_network, random_legal_actions
+from rl2grid.algorithms.networks import PER_ACTION
+from rl2grid.algorithms.off_policy import OffPolicyTrainer, follow, random_legal_actions
 from rl2grid.algorithms.policy_agent import PolicyAgent, load_agent
 from rl2grid.algorithms.replay import ReplayMemory
 from rl2grid.errors import UsageError
@@ -247,8 +249,8 @@ def test_all_layers_are_trained_saved_and_followed(kind: str, tmp_path: Path):
 
 
 def test_slow_copies_move_by_tau():
-    generator = torch.Generator().manual_seed(0)
-    online, target = (make_network(3, (4,), 2, generator) for _ in range(2))
+    made = networks(3, 2)
+    online, target = (made.make(PER_ACTION, (4,)) for _ in range(2))
     expected = [
         0.9 * mine + 0.1 * theirs for mine, theirs in zip(target.parameters(), online.parameters(), strict=True)
     ]
@@ -258,7 +260,7 @@ def test_slow_copies_move_by_tau():
 
 
 def test_networks_are_relu_networks_that_begin_like_those_of_torch():
-    network = make_network(400, (300, 200), 5, torch.Generator().manual_seed(0))
+    network = networks(400, 5).make(PER_ACTION, (300, 200))
     kinds = [type(module).__name__ for module in network]
     assert kinds == ["Linear", "ReLU", "Linear", "ReLU", "Linear"]
     theirs = torch.nn.Linear(400, 300)

@@ -13,6 +13,7 @@ import pytest
 import torch
 from constrained_toys import Lever
 from gymnasium.vector import AutoresetMode
+from specs import networks
 from torch import Tensor
 from toy_grid import ToyGrid
 
@@ -389,13 +390,10 @@ def test_the_log_standard_deviations_are_trained_and_saved(tmp_path: Path):
 
 def policy(*, continuous: bool) -> ActorCritic:
     network = ActorCritic(
-        4,
-        2 if continuous else 3,
-        continuous=continuous,
+        networks(4, 2 if continuous else 3, continuous=continuous),
         actor_layers=(8,),
         critic_layers=(8,),
         initial_log_std=0.3,
-        generator=torch.Generator().manual_seed(0),
     )
     with torch.no_grad():
         network.actor[-1].weight.mul_(50.0)  # type: ignore[union-attr, operator]
@@ -409,9 +407,7 @@ class Scripted(ActorCritic):
     """Log-probabilities, entropies and values as given, so that losses can be computed by hand."""
 
     def __init__(self, log_probabilities: list[float], values: list[float], entropies: list[float]) -> None:
-        super().__init__(
-            1, 2, continuous=False, actor_layers=(), critic_layers=(), initial_log_std=0.0, generator=torch.Generator()
-        )
+        super().__init__(networks(1, 2), actor_layers=(), critic_layers=())
         self.log_probabilities = torch.tensor(log_probabilities, requires_grad=True)
         self.values = torch.tensor(values, requires_grad=True)
         self.entropies = torch.tensor(entropies)

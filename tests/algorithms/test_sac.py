@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from specs import networks
 from torch import Tensor
 from torch.distributions import Normal, TanhTransform, TransformedDistribution
 from toy_grid import ToyGrid
@@ -100,7 +101,7 @@ def test_log_densities_and_gradients_are_finite_and_exact_far_out():
 
 
 def test_samples_follow_the_density_that_is_told():
-    actor = GaussianActor(2, 1, (4,), torch.Generator().manual_seed(1))
+    actor = GaussianActor(networks(2, 1, continuous=True, seed=1), (4,))
     observations = torch.zeros(100_000, 2)
     with torch.no_grad():
         actions, log_densities = actor.sample(observations, random(100_000, 1))
@@ -115,7 +116,7 @@ def test_samples_follow_the_density_that_is_told():
 
 
 def test_deviations_stay_within_bounds_and_the_deterministic_action_is_the_squashed_mean():
-    actor = GaussianActor(2, 3, (4,), torch.Generator().manual_seed(1))
+    actor = GaussianActor(networks(2, 3, continuous=True, seed=1), (4,))
     observations = 100.0 * random(50, 2)
     with torch.no_grad():
         means, log_stds = actor(observations)
@@ -142,7 +143,7 @@ class Logits(CategoricalActor):
     """Preferences as given, whatever is observed."""
 
     def __init__(self, logits: list[list[float]]) -> None:
-        super().__init__(1, len(logits[0]), ())
+        super().__init__(networks(1, len(logits[0])), ())
         self.logits = torch.tensor(logits, requires_grad=True)
         self.network = Constant(self.logits)  # type: ignore[assignment]
 
@@ -151,7 +152,7 @@ class Values(TwinActionCritics):
     """Two values of every action as given, whatever is observed."""
 
     def __init__(self, values: list[list[list[float]]]) -> None:
-        super().__init__(1, 3, ())
+        super().__init__(networks(1, 3), ())
         self.values = torch.tensor(values, requires_grad=True)
 
     def forward(self, observations: Tensor) -> Tensor:
@@ -220,8 +221,8 @@ def test_values_of_the_actions_played():
 
 
 def test_soft_values_of_continuous_actions_are_those_of_the_sample():
-    generator = torch.Generator().manual_seed(0)
-    actor, critics, slow = GaussianActor(1, 2, (4,), generator), *(TwinCritics(1, 2, (4,), generator) for _ in range(2))
+    made = networks(1, 2, continuous=True)
+    actor, critics, slow = GaussianActor(made, (4,)), *(TwinCritics(made, (4,)) for _ in range(2))
     objective = ContinuousObjective(actor, critics, slow)
     noise, alpha = random(5, 2), torch.tensor(0.3)
     states = random(5, 1, seed=4)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from specs import networks
 from torch import Tensor
 from toy_grid import ToyGrid
 from toy_tasks import Follow, vector
@@ -32,7 +33,7 @@ class Fixed(Actor):
     """Actions as given, whatever is observed."""
 
     def __init__(self, actions: list[list[float]]) -> None:
-        super().__init__(1, len(actions[0]), ())
+        super().__init__(networks(1, len(actions[0]), continuous=True), ())
         self.actions = torch.tensor(actions)
 
     def forward(self, observations: Tensor) -> Tensor:
@@ -43,7 +44,7 @@ class Sums(TwinCritics):
     """Q_1 = sum of the action, Q_2 = 1 - 2 sum of the action."""
 
     def __init__(self) -> None:
-        super().__init__(1, 2, ())
+        super().__init__(networks(1, 2, continuous=True), ())
 
     def forward(self, observations: Tensor, actions: Tensor) -> Tensor:
         total = actions.sum(dim=-1)
@@ -75,7 +76,7 @@ def test_the_critics_loss_by_hand():
 
 
 def test_the_critics_differ_and_their_first_is_the_first():
-    critics = TwinCritics(3, 2, (4,), torch.Generator().manual_seed(0))
+    critics = TwinCritics(networks(3, 2, continuous=True), (4,))
     observations, actions = torch.randn(6, 3), torch.randn(6, 2)
     values = critics(observations, actions)
     assert values.shape == (2, 6)

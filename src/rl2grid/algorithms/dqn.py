@@ -36,13 +36,13 @@ from gymnasium.vector import VectorEnv
 from torch import Tensor, nn
 
 from rl2grid.algorithms.hyperparameters import changed_preset
+from rl2grid.algorithms.networks import NetworkFactory, Output
 from rl2grid.algorithms.off_policy import (
     ILLEGAL,
     Batch,
     OffPolicyArgs,
     OffPolicyTrainer,
     adam,
-    make_network,
     random_legal_actions,
 )
 from rl2grid.algorithms.registry import Algorithm
@@ -75,7 +75,7 @@ class Args(OffPolicyArgs):
     huber_delta: float | None = None
     """Errors beyond this count linearly instead of squared (Huber's loss); None: all are squared."""
     layers: tuple[int, ...] = (128, 128)
-    """Widths of the network's hidden layers (ReLU)."""
+    """Widths of the network's hidden layers (ReLU, in an ``mlp``)."""
     head: str = SINGLE
     """How values come out of a network: ``single``, one per action, or ``dueling`` (equation above)."""
     networks: int = 1
@@ -183,19 +183,16 @@ class QNetwork(nn.Module):
 
     def __init__(
         self,
-        observation_size: int,
-        action_size: int,
+        networks: NetworkFactory,
         layers: Sequence[int],
-        generator: torch.Generator | None = None,
         head: str = SINGLE,
         count: int = 1,
     ) -> None:
         super().__init__()
-        self.observation_size = observation_size
-        self.action_size = action_size
+        self.observation_size, self.action_size = networks.spec.observation_size, networks.spec.action_size
         self.dueling = head == DUELING
-        outputs = action_size + self.dueling
-        self.networks = nn.ModuleList(make_network(observation_size, layers, outputs, generator) for _ in range(count))
+        output = Output(per_state=int(self.dueling), per_action=1)
+        self.networks = nn.ModuleList(networks.make(output, layers) for _ in range(count))
 
     def forward(self, observations: Tensor) -> Tensor:
         """Q of observations [batch, size] -> [batch, actions]: the least of what the networks say."""
@@ -223,8 +220,8 @@ def best_actions(values: Tensor, masks: Tensor | None) -> Tensor:
 
 def load_policy(state: Mapping[str, Any]) -> QNetwork:
     """The network of a checkpoint's section ``policy``."""
-    sizes = (state["observation_size"], state["action_size"], state["layers"])
-    network = QNetwork(*sizes, head=state["head"], count=state["networks"])
+    networks = NetworkFactory.from_state(state["factory"])
+    network = QNetwork(networks, state["layers"], state["head"], state["networks"])
     network.load_state_dict(state["network"])
     return network
 
@@ -263,8 +260,7 @@ class DQN(OffPolicyTrainer):
         """
         super().__init__(args, envs)
         _refuse_continuous(self.continuous)
-        sizes = (self.observation_size, self.action_size, args.layers)
-        self.network = QNetwork(*sizes, self.generator, args.head, args.networks).to(self.device)
+        self.network = QNetwork(self.networks, args.layers, args.head, args.networks).to(self.device)
         self.target = copy.deepcopy(self.network)
         self.optimizer = adam(self.network, args.learning_rate)
         self._renewals = 0

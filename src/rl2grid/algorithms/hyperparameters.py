@@ -4,12 +4,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, ClassVar, TypeVar
 
 from rl2grid.errors import UsageError, one_of
 
 DEVICES = ("auto", "cpu", "cuda")
+
+_ADDED_LATER = "added_later"
+
+
+def added_later(default: Any) -> Any:
+    """A field of hyperparameters that results were recorded without; they were all reached with its default.
+
+    While it has that value it is left out of what identifies a training, see :func:`identifying`.
+    """
+    return field(default=default, metadata={_ADDED_LATER: True})
+
+
+def identifying(args: Any) -> dict[str, Any]:
+    """The hyperparameters by which a training is told from others: all but later ones that have their default."""
+    later = [each for each in fields(args) if each.metadata.get(_ADDED_LATER)]
+    left_out = {each.name for each in later if getattr(args, each.name) == each.default}
+    return {name: value for name, value in asdict(args).items() if name not in left_out}
 
 
 @dataclass(frozen=True)
@@ -37,6 +54,8 @@ class SharedArgs:
     """Discrete actions only: whether illegal actions are excluded (the environment has ``action_masks()``)."""
     normalize_observations: bool = True
     """Whether observations are scaled by running statistics shared by all environments."""
+    network: str = added_later("mlp")
+    """Kind of the networks, by name: ``mlp``, or one that was registered (:mod:`rl2grid.algorithms.networks`)."""
     torch_threads: int = 1
     """Threads of PyTorch; results are reproducible bit by bit for a given number only."""
     device: str = "cpu"

@@ -26,8 +26,6 @@ Randomness
 
 from __future__ import annotations
 
-import itertools
-import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -41,6 +39,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from rl2grid.algorithms.hyperparameters import SharedArgs
+from rl2grid.algorithms.networks import VALUE_OF_ACTION, NetworkFactory
 from rl2grid.algorithms.playing import Tally
 from rl2grid.algorithms.replay import ReplayMemory, Step, computer_memory
 from rl2grid.algorithms.trainer import Trainer
@@ -89,28 +88,12 @@ ILLEGAL = -1e8
 """Value or logit of an illegal action: never the largest, probability exactly zero in float32, and finite."""
 
 
-def make_network(inputs: int, layers: Sequence[int], outputs: int, generator: torch.Generator | None) -> nn.Sequential:
-    """A ReLU network; weights and biases are uniform within 1 / sqrt(inputs of the layer), PyTorch's own default."""
-    widths = (inputs, *layers, outputs)
-    modules: list[nn.Module] = []
-    for k, (width, next_width) in enumerate(itertools.pairwise(widths)):
-        # Linear's own initialisation would draw from the global random state.
-        linear = nn.utils.skip_init(nn.Linear, width, next_width)  # type: ignore[no-untyped-call]
-        for parameter in (linear.weight, linear.bias):
-            nn.init.uniform_(parameter, -1.0 / math.sqrt(width), 1.0 / math.sqrt(width), generator=generator)
-        modules += [linear] if k == len(widths) - 2 else [linear, nn.ReLU()]
-    return nn.Sequential(*modules)
-
-
 class TwinCritics(nn.Module):
     """Two values of a continuous action, learned independently."""
 
-    def __init__(
-        self, observation_size: int, action_size: int, layers: Sequence[int], generator: torch.Generator | None = None
-    ) -> None:
+    def __init__(self, networks: NetworkFactory, layers: Sequence[int]) -> None:
         super().__init__()
-        inputs = observation_size + action_size
-        self.networks = nn.ModuleList(make_network(inputs, layers, 1, generator) for _ in range(2))
+        self.networks = nn.ModuleList(networks.make(VALUE_OF_ACTION, layers) for _ in range(2))
 
     def forward(self, observations: Tensor, actions: Tensor) -> Tensor:
         """Both values of observations [batch, size] and actions [batch, dimensions] -> [2, batch]."""

@@ -29,7 +29,6 @@ Randomness and devices
 
 from __future__ import annotations
 
-import itertools
 import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
@@ -44,6 +43,7 @@ from torch import Tensor, nn
 
 from rl2grid.algorithms.diagnostics import mean
 from rl2grid.algorithms.hyperparameters import SharedArgs
+from rl2grid.algorithms.networks import PER_ACTION, VALUE, NetworkFactory, orthogonal
 from rl2grid.algorithms.playing import Tally
 from rl2grid.algorithms.trainer import Played, Trainer
 from rl2grid.envs.normalization import NormalizeObservation
@@ -74,9 +74,9 @@ class OnPolicyArgs(SharedArgs):
     target_kl: float | None = 0.03
     """An update ends after the epoch in which the approximate KL divergence passes this; None: never early."""
     actor_layers: tuple[int, ...] = (128, 128)
-    """Widths of the policy's hidden layers (tanh)."""
+    """Widths of the policy's hidden layers (tanh, in an ``mlp``)."""
     critic_layers: tuple[int, ...] = (128, 128)
-    """Widths of every value function's hidden layers (tanh)."""
+    """Widths of every value function's hidden layers (tanh, in an ``mlp``)."""
     initial_do_nothing: float | None = None
     """Discrete actions only: probability of action 0 before training; None: all actions are about alike."""
     initial_log_std: float = -1.0
@@ -99,39 +99,28 @@ _ILLEGAL_LOGIT = -1e8
 
 
 class ActorCritic(nn.Module):
-    """The policy, the value function, and a value function of every cost: separate tanh networks."""
+    """The policy, the value function, and a value function of every cost: separate networks."""
 
     def __init__(
         self,
-        observation_size: int,
-        action_size: int,
+        networks: NetworkFactory,
         *,
-        continuous: bool,
         actor_layers: Sequence[int],
         critic_layers: Sequence[int],
-        initial_log_std: float,
+        initial_log_std: float = 0.0,
+        initial_do_nothing: float | None = None,
         n_costs: int = 0,
-        generator: torch.Generator | None = None,
     ) -> None:
-        """``action_size``: number of discrete actions, or dimensions of the continuous action."""
+        """The arguments are those of :class:`OnPolicyArgs`; ``n_costs``: costs with critics of their own."""
         super().__init__()
-        self.observation_size = observation_size
-        self.action_size = action_size
-        self.continuous = continuous
-        self.actor = _network(observation_size, actor_layers, action_size, 0.01, generator)
-        self.critic = _network(observation_size, critic_layers, 1, 1.0, generator)
-        self.cost_critics = nn.ModuleList(
-            _network(observation_size, critic_layers, 1, 1.0, generator) for _ in range(n_costs)
-        )
-        if continuous:
-            self.log_std = nn.Parameter(torch.full((action_size,), initial_log_std))
-
-    def prefer_first_action(self, probability: float) -> None:
-        """Shift the last layer so that action 0 has about this probability in every state."""
-        last = self.actor[-1]
-        assert isinstance(last, nn.Linear)
-        with torch.no_grad():
-            last.bias[0] = math.log(probability / (1.0 - probability) * (self.action_size - 1))
+        self.observation_size, self.action_size = networks.spec.observation_size, networks.spec.action_size
+        self.continuous = networks.spec.continuous
+        do_nothing = None if self.continuous else initial_do_nothing
+        self.actor = networks.make(PER_ACTION, actor_layers, orthogonal(0.01), do_nothing)
+        self.critic = networks.make(VALUE, critic_layers, orthogonal(1.0))
+        self.cost_critics = nn.ModuleList(networks.make(VALUE, critic_layers, orthogonal(1.0)) for _ in range(n_costs))
+        if self.continuous:
+            self.log_std = nn.Parameter(torch.full((self.action_size,), initial_log_std))
 
     def actor_parameters(self) -> list[nn.Parameter]:
         """Everything that the policy depends on, the log standard deviations included."""
@@ -187,31 +176,12 @@ def _log_probabilities(logits: Tensor, masks: Tensor | None) -> Tensor:
     return logits.log_softmax(dim=-1)
 
 
-def _network(
-    inputs: int, layers: Sequence[int], outputs: int, output_gain: float, generator: torch.Generator | None
-) -> nn.Sequential:
-    """A tanh network with orthogonal weights; a small ``output_gain`` makes the first policy nearly indifferent."""
-    widths = (inputs, *layers, outputs)
-    modules: list[nn.Module] = []
-    for k, (width, next_width) in enumerate(itertools.pairwise(widths)):
-        last = k == len(widths) - 2
-        # Linear's own initialisation would draw from the global random state.
-        linear = nn.utils.skip_init(nn.Linear, width, next_width)  # type: ignore[no-untyped-call]
-        nn.init.orthogonal_(linear.weight, output_gain if last else math.sqrt(2.0), generator)
-        nn.init.zeros_(linear.bias)
-        modules += [linear] if last else [linear, nn.Tanh()]
-    return nn.Sequential(*modules)
-
-
 def load_policy(state: Mapping[str, Any]) -> ActorCritic:
     """The networks of a checkpoint's section ``policy``."""
     network = ActorCritic(
-        state["observation_size"],
-        state["action_size"],
-        continuous=state["continuous"],
+        NetworkFactory.from_state(state["factory"]),
         actor_layers=state["actor_layers"],
         critic_layers=state["critic_layers"],
-        initial_log_std=0.0,
         n_costs=state["n_costs"],
     )
     network.load_state_dict(state["network"])
@@ -340,17 +310,13 @@ class OnPolicyTrainer(Trainer):
         if args.normalize_observations:
             self.envs = NormalizeObservation(envs)
         self.network = ActorCritic(
-            self.observation_size,
-            self.action_size,
-            continuous=self.continuous,
+            self.networks,
             actor_layers=args.actor_layers,
             critic_layers=args.critic_layers,
             initial_log_std=args.initial_log_std,
+            initial_do_nothing=args.initial_do_nothing,
             n_costs=n_costs,
-            generator=self.generator,
         )
-        if args.initial_do_nothing is not None and not self.continuous:
-            self.network.prefer_first_action(args.initial_do_nothing)
         self.network.to(self.device)
         critics = (self.network.critic, *self.network.cost_critics)
         self._groups = (self.network.actor_parameters(), *(list(critic.parameters()) for critic in critics))

@@ -45,6 +45,7 @@ from gymnasium.vector import VectorEnv
 from torch import Tensor, nn
 
 from rl2grid.algorithms.hyperparameters import changed_preset
+from rl2grid.algorithms.networks import PER_ACTION, NetworkFactory, Output
 from rl2grid.algorithms.off_policy import (
     ILLEGAL,
     Batch,
@@ -53,7 +54,6 @@ from rl2grid.algorithms.off_policy import (
     TwinCritics,
     adam,
     follow,
-    make_network,
     random_legal_actions,
 )
 from rl2grid.algorithms.registry import Algorithm
@@ -92,9 +92,9 @@ class Args(OffPolicyArgs):
     initial_do_nothing: float | None = None
     """Discrete actions only: probability of action 0 before training; None: all actions are about alike."""
     actor_layers: tuple[int, ...] = (128, 128)
-    """Widths of the policy's hidden layers (ReLU)."""
+    """Widths of the policy's hidden layers (ReLU, in an ``mlp``)."""
     critic_layers: tuple[int, ...] = (128, 128)
-    """Widths of each critic's hidden layers (ReLU)."""
+    """Widths of each critic's hidden layers (ReLU, in an ``mlp``)."""
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work; see :class:`OffPolicyArgs`."""
@@ -184,15 +184,12 @@ class GaussianActor(nn.Module):
 
     def __init__(
         self,
-        observation_size: int,
-        action_size: int,
+        networks: NetworkFactory,
         layers: Sequence[int],
-        generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
-        self.observation_size = observation_size
-        self.action_size = action_size
-        self.network = make_network(observation_size, layers, 2 * action_size, generator)
+        self.observation_size, self.action_size = networks.spec.observation_size, networks.spec.action_size
+        self.network = networks.make(Output(per_action=2), layers)
 
     def forward(self, observations: Tensor) -> tuple[Tensor, Tensor]:
         """Means and log deviations of u, each [batch, dimensions], the latter within fixed bounds."""
@@ -231,22 +228,13 @@ class CategoricalActor(nn.Module):
 
     def __init__(
         self,
-        observation_size: int,
-        action_size: int,
+        networks: NetworkFactory,
         layers: Sequence[int],
-        generator: torch.Generator | None = None,
+        initial_do_nothing: float | None = None,
     ) -> None:
         super().__init__()
-        self.observation_size = observation_size
-        self.action_size = action_size
-        self.network = make_network(observation_size, layers, action_size, generator)
-
-    def prefer_first_action(self, probability: float) -> None:
-        """Shift the last layer so that action 0 has about this probability in every state."""
-        last = self.network[-1]
-        assert isinstance(last, nn.Linear)
-        with torch.no_grad():
-            last.bias[0] = math.log(probability / (1.0 - probability) * (self.action_size - 1))
+        self.observation_size, self.action_size = networks.spec.observation_size, networks.spec.action_size
+        self.network = networks.make(PER_ACTION, layers, do_nothing=initial_do_nothing)
 
     def forward(self, observations: Tensor, masks: Tensor | None) -> Tensor:
         """Log-probabilities [batch, actions], of illegal actions large and negative."""
@@ -272,13 +260,11 @@ class TwinActionCritics(nn.Module):
 
     def __init__(
         self,
-        observation_size: int,
-        action_size: int,
+        networks: NetworkFactory,
         layers: Sequence[int],
-        generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
-        self.networks = nn.ModuleList(make_network(observation_size, layers, action_size, generator) for _ in range(2))
+        self.networks = nn.ModuleList(networks.make(PER_ACTION, layers) for _ in range(2))
 
     def forward(self, observations: Tensor) -> Tensor:
         """Both values of observations [batch, size] -> [2, batch, actions]."""
@@ -287,8 +273,9 @@ class TwinActionCritics(nn.Module):
 
 def load_policy(state: Mapping[str, Any]) -> GaussianActor | CategoricalActor:
     """The network of a checkpoint's section ``policy``."""
-    make = GaussianActor if state["continuous"] else CategoricalActor
-    actor = make(state["observation_size"], state["action_size"], state["actor_layers"])
+    networks = NetworkFactory.from_state(state["factory"])
+    make = GaussianActor if networks.spec.continuous else CategoricalActor
+    actor = make(networks, state["actor_layers"])
     actor.load_state_dict(state["network"])
     return actor
 
@@ -406,17 +393,13 @@ class SAC(OffPolicyTrainer):
         self.temperature_optimizer = adam(self.temperature, args.temperature_learning_rate)
 
     def _continuous(self) -> ContinuousObjective:
-        sizes = (self.observation_size, self.action_size)
-        actor = GaussianActor(*sizes, self.args.actor_layers, self.generator).to(self.device)
-        critics = TwinCritics(*sizes, self.args.critic_layers, self.generator).to(self.device)
+        actor = GaussianActor(self.networks, self.args.actor_layers).to(self.device)
+        critics = TwinCritics(self.networks, self.args.critic_layers).to(self.device)
         return ContinuousObjective(actor, critics, copy.deepcopy(critics))
 
     def _discrete(self) -> DiscreteObjective:
-        sizes = (self.observation_size, self.action_size)
-        actor = CategoricalActor(*sizes, self.args.actor_layers, self.generator).to(self.device)
-        if self.args.initial_do_nothing is not None:
-            actor.prefer_first_action(self.args.initial_do_nothing)
-        critics = TwinActionCritics(*sizes, self.args.critic_layers, self.generator).to(self.device)
+        actor = CategoricalActor(self.networks, self.args.actor_layers, self.args.initial_do_nothing).to(self.device)
+        critics = TwinActionCritics(self.networks, self.args.critic_layers).to(self.device)
         return DiscreteObjective(actor, critics, copy.deepcopy(critics))
 
     @property

@@ -28,6 +28,7 @@ from gymnasium.vector import VectorEnv
 from torch import Tensor, nn
 
 from rl2grid.algorithms.hyperparameters import changed_preset
+from rl2grid.algorithms.networks import PER_ACTION, NetworkFactory
 from rl2grid.algorithms.off_policy import (
     Batch,
     OffPolicyArgs,
@@ -35,7 +36,6 @@ from rl2grid.algorithms.off_policy import (
     TwinCritics,
     adam,
     follow,
-    make_network,
 )
 from rl2grid.algorithms.registry import Algorithm
 from rl2grid.errors import UsageError
@@ -66,9 +66,9 @@ class Args(OffPolicyArgs):
     noise_clip: float = 0.5
     """Bound of the latter noise."""
     actor_layers: tuple[int, ...] = (128, 128)
-    """Widths of the policy's hidden layers (ReLU)."""
+    """Widths of the policy's hidden layers (ReLU, in an ``mlp``)."""
     critic_layers: tuple[int, ...] = (128, 128)
-    """Widths of each critic's hidden layers (ReLU)."""
+    """Widths of each critic's hidden layers (ReLU, in an ``mlp``)."""
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work; see :class:`OffPolicyArgs`."""
@@ -154,15 +154,12 @@ class Actor(nn.Module):
 
     def __init__(
         self,
-        observation_size: int,
-        action_size: int,
+        networks: NetworkFactory,
         layers: Sequence[int],
-        generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
-        self.observation_size = observation_size
-        self.action_size = action_size
-        self.network = make_network(observation_size, layers, action_size, generator)
+        self.observation_size, self.action_size = networks.spec.observation_size, networks.spec.action_size
+        self.network = networks.make(PER_ACTION, layers)
 
     def forward(self, observations: Tensor) -> Tensor:
         """Actions for observations [batch, size], float32 [batch, dimensions] in [-1, 1]."""
@@ -177,7 +174,7 @@ class Actor(nn.Module):
 
 def load_policy(state: Mapping[str, Any]) -> Actor:
     """The network of a checkpoint's section ``policy``."""
-    actor = Actor(state["observation_size"], state["action_size"], state["actor_layers"])
+    actor = Actor(NetworkFactory.from_state(state["factory"]), state["actor_layers"])
     actor.load_state_dict(state["network"])
     return actor
 
@@ -215,9 +212,8 @@ class TD3(OffPolicyTrainer):
         """
         super().__init__(args, envs)
         _refuse_discrete(self.continuous)
-        sizes = (self.observation_size, self.action_size)
-        self.actor = Actor(*sizes, args.actor_layers, self.generator).to(self.device)
-        self.critics = TwinCritics(*sizes, args.critic_layers, self.generator).to(self.device)
+        self.actor = Actor(self.networks, args.actor_layers).to(self.device)
+        self.critics = TwinCritics(self.networks, args.critic_layers).to(self.device)
         self.slow_actor = copy.deepcopy(self.actor)
         self.slow_critics = copy.deepcopy(self.critics)
         self.actor_optimizer = adam(self.actor, args.actor_learning_rate)

@@ -24,14 +24,15 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
-from gymnasium.spaces import Box
 from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from rl2grid.algorithms.devices import find_device
 from rl2grid.algorithms.hyperparameters import SharedArgs
+from rl2grid.algorithms.networks import NetworkFactory, find_network
 from rl2grid.algorithms.playing import Tally, check_environments, of_transition, reported, resume_environments
+from rl2grid.envs.spec import spec_of
 from rl2grid.errors import UsageError
 
 
@@ -80,10 +81,14 @@ class Trainer(ABC):
         )
         self.envs = envs
         self.generator = torch.Generator().manual_seed(args.seed)
-        observation_shape, action_space = envs.single_observation_space.shape, envs.single_action_space
-        assert observation_shape is not None
-        self.observation_size = int(observation_shape[0])
-        self.action_size = int(action_space.shape[0] if isinstance(action_space, Box) else action_space.n)  # type: ignore[attr-defined]
+        self.spec = spec_of(envs)
+        self.observation_size, self.action_size = self.spec.observation_size, self.spec.action_size
+        if args.normalize_observations and not find_network(args.network).reads_normalized:
+            raise UsageError(
+                f"Network {args.network!r} reads observations as the environment gives them: set "
+                "normalize_observations to False."
+            )
+        self.networks = NetworkFactory(self.spec, args.network, self.generator)
         self.reward_scale = 1.0 - args.gamma if args.reward_scale is None else args.reward_scale
 
         self.num_iterations = args.total_timesteps // (args.num_envs * args.num_steps)
@@ -128,9 +133,7 @@ class Trainer(ABC):
         return {
             "network": network.state_dict(),
             "normalizer": self.normalizer_state(),
-            "observation_size": self.observation_size,
-            "action_size": self.action_size,
-            "continuous": self.continuous,
+            "factory": self.networks.state_dict(),
             "mask_actions": self.args.mask_actions,
             **sizes,
         }

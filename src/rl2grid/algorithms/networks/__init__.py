@@ -1,0 +1,205 @@
+"""Networks by name: what maps observations to the numbers that an algorithm learns.
+
+An algorithm asks for a network by a :class:`Request`: which task it is of, which numbers are wanted, how wide its
+layers are. Whoever answers is chosen by name, the hyperparameter ``network``; a network of one's own is a function from
+the request to a ``torch.nn.Module`` and a call of :func:`register_network`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any, Self
+
+import torch
+from torch import nn
+
+from rl2grid.envs.spec import Spec, spec_from_state
+from rl2grid.errors import UsageError, one_of
+
+
+@dataclass(frozen=True)
+class Output:
+    """The numbers that a network gives for every observation: first those of the state, then those of the actions."""
+
+    per_state: int = 0
+    """Numbers for the state as a whole: 1 for a value."""
+    per_action: int = 0
+    """Numbers for every discrete action, or every dimension of a continuous one: the first number of all actions, then
+    the second of all."""
+    reads_action: bool = False
+    """Whether what it reads is an observation followed by a continuous action."""
+
+    def inputs(self, spec: Spec) -> int:
+        """Numbers that the network reads."""
+        return spec.observation_size + (spec.action_size if self.reads_action else 0)
+
+    def width(self, spec: Spec) -> int:
+        """Numbers that it gives."""
+        return self.per_state + self.per_action * spec.action_size
+
+
+VALUE = Output(per_state=1)
+"""V(s)."""
+PER_ACTION = Output(per_action=1)
+"""Logits, means or values of actions."""
+VALUE_OF_ACTION = Output(per_state=1, reads_action=True)
+"""Q(s, a) of a continuous action."""
+
+
+@dataclass(frozen=True)
+class Style:
+    """How the layers of an algorithm's networks are activated and begin."""
+
+    activation: Callable[[], nn.Module]
+    """Makes what follows every layer but the last."""
+    begin: Callable[[nn.Linear, bool, torch.Generator | None], None]
+    """``begin(layer, is_last, generator)`` draws its first weights."""
+
+    def linear(self, inputs: int, outputs: int, *, last: bool, generator: torch.Generator | None) -> nn.Linear:
+        """A layer with its first weights; the global random state is left alone."""
+        # Linear's own initialisation would draw from it.
+        layer: nn.Linear = nn.utils.skip_init(nn.Linear, inputs, outputs)  # type: ignore[no-untyped-call]
+        self.begin(layer, last, generator)
+        return layer
+
+
+def orthogonal(output_gain: float) -> Style:
+    """Tanh and orthogonal weights; a small ``output_gain`` makes a first policy nearly indifferent."""
+
+    def begin(layer: nn.Linear, last: bool, generator: torch.Generator | None) -> None:
+        nn.init.orthogonal_(layer.weight, output_gain if last else math.sqrt(2.0), generator)
+        nn.init.zeros_(layer.bias)
+
+    return Style(nn.Tanh, begin)
+
+
+def _uniform(layer: nn.Linear, last: bool, generator: torch.Generator | None) -> None:
+    bound = 1.0 / math.sqrt(layer.in_features)
+    for parameter in (layer.weight, layer.bias):
+        nn.init.uniform_(parameter, -bound, bound, generator=generator)
+
+
+UNIFORM = Style(nn.ReLU, _uniform)
+"""ReLU and weights within 1 / sqrt(inputs of the layer), PyTorch's own default."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """What an algorithm asks a network for."""
+
+    spec: Spec
+    """What is observed and what can be done."""
+    output: Output
+    """Which numbers are wanted."""
+    layers: tuple[int, ...] = ()
+    """Widths of hidden layers, first to last, as far as the network has such."""
+    style: Style = UNIFORM
+    """Activation and first weights, as far as the network has no better ones of its own."""
+    first_action: float | None = None
+    """Where the first number of action 0 begins, in every state: the logit by which a policy prefers to do nothing.
+    None: like those of the others."""
+    generator: torch.Generator | None = None
+    """The source of all random weights."""
+
+
+@dataclass(frozen=True)
+class Network:
+    """A kind of network."""
+
+    name: str
+    build: Callable[[Request], nn.Module]
+    """Makes a module from float32 [batch, inputs] to float32 [batch, width]; see :class:`Output`."""
+    reads_normalized: bool = True
+    """Whether it may be given observations scaled by running statistics. A network that reads busbars or line states
+    from them may not."""
+    needs_grid: bool = False
+    """Whether it is for tasks of rl2grid alone, whose ``Spec`` has a grid."""
+
+
+_IN_PACKAGE = {"mlp": "rl2grid.algorithms.networks.mlp"}
+"""The file of each, whose ``NETWORK`` describes it."""
+_ADDED: dict[str, Network] = {}
+
+
+def register_network(network: Network) -> None:
+    """Let algorithms use a network by its name, in this process.
+
+    Raises:
+        UsageError: the name is taken by another network.
+    """
+    if network.name in _IN_PACKAGE or _ADDED.get(network.name, network) != network:
+        raise UsageError(f"Network {network.name!r} exists already: choose another name.")
+    _ADDED[network.name] = network
+
+
+def network_names() -> tuple[str, ...]:
+    """All names, those of the package first."""
+    return (*_IN_PACKAGE, *_ADDED)
+
+
+def find_network(name: str) -> Network:
+    """The network called ``name``.
+
+    Raises:
+        UsageError: there is none.
+    """
+    if name in _ADDED:
+        return _ADDED[name]
+    if name not in _IN_PACKAGE:
+        raise one_of("Network", name, network_names())
+    network = import_module(_IN_PACKAGE[name]).NETWORK
+    assert isinstance(network, Network)
+    return network
+
+
+@dataclass(frozen=True)
+class NetworkFactory:
+    """Makes networks of one kind for one task."""
+
+    spec: Spec
+    name: str = "mlp"
+    """Of the kind; see :func:`network_names`."""
+    generator: torch.Generator | None = None
+    """The source of all random weights; None: they will be loaded."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be made.
+
+        Raises:
+            UsageError: there is no such network, or it needs a grid where there is none.
+        """
+        if find_network(self.name).needs_grid and self.spec.grid is None:
+            raise UsageError(f"Network {self.name!r} is for tasks of rl2grid: this environment has no grid.")
+
+    def make(
+        self, output: Output, layers: Sequence[int], style: Style = UNIFORM, do_nothing: float | None = None
+    ) -> nn.Module:
+        """A network that gives these numbers.
+
+        Args:
+            output: Which numbers.
+            layers: Widths of hidden layers.
+            style: Activation and first weights.
+            do_nothing: Probability of action 0 in every state, if the numbers are logits and the others about alike.
+        """
+        first = None
+        if do_nothing is not None:
+            first = math.log(do_nothing / (1.0 - do_nothing) * (self.spec.action_size - 1))
+        request = Request(self.spec, output, tuple(layers), style, first, self.generator)
+        return find_network(self.name).build(request)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Plain values from which :meth:`from_state` makes it again."""
+        return {"name": self.name, "spec": self.spec.state_dict()}
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any]) -> Self:
+        """The factory whose ``state_dict`` this was; what it makes has no weights yet.
+
+        Raises:
+            UsageError: there is no such network or task any more.
+        """
+        return cls(spec_from_state(state["spec"]), state["name"])

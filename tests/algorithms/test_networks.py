@@ -1,0 +1,220 @@
+"""Networks as a choice: a user's own, built from what the task is, with every kind of algorithm."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.vector import AutoresetMode
+from torch import Tensor, nn
+
+import rl2grid
+from rl2grid.algorithms import networks
+from rl2grid.algorithms.hyperparameters import identifying
+from rl2grid.algorithms.networks import (
+    PER_ACTION,
+    VALUE,
+    VALUE_OF_ACTION,
+    Network,
+    NetworkFactory,
+    Output,
+    Request,
+    network_names,
+    register_network,
+)
+from rl2grid.algorithms.registry import find_algorithm
+from rl2grid.envs.registration import register_all
+from rl2grid.envs.spec import Spec, task_spec
+from rl2grid.envs.tasks import find_task
+from rl2grid.errors import UsageError
+from rl2grid.mdp.actions import ActionCatalogue
+from rl2grid.records.evaluations import identity_hash
+from rl2grid.training.runs import RunArgs, hyperparameters, make_envs, train
+
+LEDGER = Path(__file__).resolve().parents[2] / "benchmarks" / "results" / "baselines.json"
+
+
+class Lines(nn.Module):
+    """A network of a grid in a few lines: every line is read alike, substations sum their lines, and an action is worth
+    what its substation or line is.
+    """
+
+    def __init__(self, request: Request) -> None:
+        super().__init__()
+        spec, output = request.spec, request.output
+        assert spec.grid is not None
+        self.output, width = output, request.layers[0]
+        rho = spec.feature("rho")
+        self.lines = slice(rho.begin, rho.end)
+        self.actions = slice(spec.observation_size, output.inputs(spec))
+        self.each = request.style.linear(1, width, last=False, generator=request.generator)
+        self.whole = request.style.linear(
+            width + output.inputs(spec) - spec.observation_size,
+            output.per_state + output.per_action,
+            last=True,
+            generator=request.generator,
+        )
+        self.first = nn.Parameter(torch.tensor(request.first_action or 0.0))
+        at = torch.zeros(spec.grid.n_sub + spec.grid.n_line, spec.grid.n_line)
+        lines = torch.arange(spec.grid.n_line)
+        at[torch.as_tensor(spec.grid.line_or_to_subid, dtype=torch.int64), lines] = 1.0
+        at[torch.as_tensor(spec.grid.line_ex_to_subid, dtype=torch.int64), lines] = 1.0
+        at[spec.grid.n_sub + lines, lines] = 1.0
+        places = np.zeros(spec.action_size, np.int64)
+        if isinstance(spec.actions, ActionCatalogue):
+            places = spec.actions.target + np.where(spec.actions.kind == 2, spec.grid.n_sub, 0)
+        self.register_buffer("lines_of_action", at[torch.as_tensor(places)], persistent=False)
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        each = self.each(inputs[..., self.lines].unsqueeze(-1)).relu()
+        whole = self.whole(torch.cat([each.sum(dim=-2), inputs[..., self.actions]], dim=-1))
+        if not self.output.per_action:
+            return whole
+        acted_on = self.lines_of_action @ each
+        if self.actions.stop > self.actions.start:
+            raise AssertionError("numbers of actions are not asked for where an action is read")
+        per_action = self.whole(acted_on)[..., self.output.per_state :]
+        preferred = torch.zeros(per_action.shape[-2:])
+        preferred[0, 0] = 1.0
+        per_action = per_action + self.first * preferred
+        return torch.cat([whole[..., : self.output.per_state], per_action.transpose(-1, -2).flatten(-2)], dim=-1)
+
+
+@pytest.fixture(autouse=True)
+def lines(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The one line of a user."""
+    monkeypatch.setattr(networks, "_ADDED", {})
+    register_network(Network("lines", Lines, reads_normalized=False, needs_grid=True))
+
+
+def args(algorithm: str, task: str, **changes: Any) -> Any:
+    small = {"total_timesteps": 4 * 8 * 6, "num_envs": 4, "num_steps": 8, "network": "lines"}
+    off_policy = {"learning_starts": 40, "batch_size": 16, "buffer_bytes": 2**20}
+    own = off_policy if algorithm in ("dqn", "sac", "td3") else {}
+    return hyperparameters(algorithm, task, **{**small, **own, "normalize_observations": False, **changes})
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "task"),
+    [("ppo", "bus14-T0"), ("dqn", "bus14-T0"), ("sac", "bus14-T0"), ("sac", "bus14-R"), ("ppo", "bus14-R")],
+)
+def test_a_network_of_ones_own_is_trained_saved_and_played(algorithm: str, task: str, tmp_path: Path):
+    chosen = args(algorithm, task)
+    folder = train(
+        RunArgs(task, chosen, algorithm, tmp_path / "run", validation_months=0, tensorboard=False, progress=False)
+    )
+    request = RunArgs(task, chosen, algorithm, env_keywords={})
+    envs = make_envs(request)
+    begun = find_algorithm(algorithm).trainer(chosen, envs).policy()[0]  # type: ignore[attr-defined]
+    envs.close()
+    agent = rl2grid.load(folder)
+    layers = [module for module in agent._network.modules() if isinstance(module, Lines)]
+    assert layers, "another network was made"
+    moved = [
+        name
+        for name, tensor in begun.state_dict().items()
+        if not torch.equal(tensor, agent._network.state_dict()[name]) and name.endswith("weight")
+    ]
+    assert any("each.weight" in name for name in moved)
+    env = gymnasium.make(f"rl2grid/{task}-v0")
+    agent.bind(env)
+    observation, info = env.reset(seed=3)
+    agent.reset(0)
+    for _ in range(5):
+        observation, _, terminated, truncated, info = env.step(agent.act(observation, info))
+        if terminated or truncated:
+            break
+    env.close()
+
+
+def test_observations_that_it_cannot_read_and_tasks_without_grid_are_refused():
+    register_all()
+    envs = make_envs(RunArgs("bus14-T0", args("ppo", "bus14-T0"), "ppo"))
+    with pytest.raises(UsageError, match=r"'lines' reads observations as .*: set normalize_observations to False"):
+        find_algorithm("ppo").trainer(args("ppo", "bus14-T0", normalize_observations=True), envs)
+    with pytest.raises(UsageError, match="'transformer' does not exist: choose one of mlp, lines"):
+        find_algorithm("ppo").trainer(args("ppo", "bus14-T0", network="transformer"), envs)
+    envs.close()
+    cartpole = gymnasium.vector.SyncVectorEnv(
+        [lambda: gymnasium.make("CartPole-v1")] * 4, autoreset_mode=AutoresetMode.SAME_STEP
+    )
+    with pytest.raises(UsageError, match="'lines' is for tasks of rl2grid: this environment has no grid"):
+        find_algorithm("ppo").trainer(args("ppo", "bus14-T0", mask_actions=False), cartpole)
+
+
+def test_names_are_given_once():
+    assert network_names() == ("mlp", "lines")
+    register_network(Network("lines", Lines, reads_normalized=False, needs_grid=True))
+    with pytest.raises(UsageError, match="'lines' exists already"):
+        register_network(Network("lines", Lines))
+    with pytest.raises(UsageError, match="'mlp' exists already"):
+        register_network(Network("mlp", Lines))
+
+
+# --- What is asked for ----------------------------------------------------------------------------------------------
+
+SPEC = Spec(5, 3, continuous=False)
+
+
+@pytest.mark.parametrize(
+    ("output", "inputs", "width"),
+    [(VALUE, 5, 1), (PER_ACTION, 5, 3), (VALUE_OF_ACTION, 8, 1), (Output(1, 1), 5, 4), (Output(per_action=2), 5, 6)],
+)
+def test_the_mlp_gives_the_numbers_asked_for(output: Output, inputs: int, width: int):
+    network = NetworkFactory(SPEC, generator=torch.Generator().manual_seed(0)).make(output, (7,))
+    assert network(torch.zeros(2, inputs)).shape == (2, width)
+    assert [tuple(p.shape) for p in network.parameters()] == [(7, inputs), (7,), (width, 7), (width,)]
+
+
+def test_doing_nothing_has_the_probability_asked_for():
+    factory = NetworkFactory(Spec(5, 40, continuous=False), generator=torch.Generator().manual_seed(0))
+    network = factory.make(PER_ACTION, (), networks.orthogonal(0.01), do_nothing=0.6)
+    probabilities = network(torch.zeros(1, 5)).softmax(dim=-1)[0].detach()
+    assert float(probabilities[0]) == pytest.approx(0.6, abs=1e-5)
+    assert float(probabilities[1:].max()) == pytest.approx(0.4 / 39, abs=1e-5)
+
+
+def test_a_factory_comes_back_from_plain_values():
+    factory = NetworkFactory(task_spec(find_task("bus14-T0")), "lines", torch.Generator())
+    again = NetworkFactory.from_state(json.loads(json.dumps(factory.state_dict())))
+    assert (again.name, again.spec.grid, again.generator) == ("lines", factory.spec.grid, None)
+
+
+def test_weights_do_not_come_from_the_global_random_state():
+    weights = []
+    before = torch.get_rng_state()
+    for _ in range(2):
+        network = NetworkFactory(SPEC, generator=torch.Generator().manual_seed(3)).make(PER_ACTION, (7,))
+        weights.append(nn.utils.parameters_to_vector(network.parameters()))
+    assert torch.equal(*weights)
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+# --- What identifies a training -------------------------------------------------------------------------------------
+
+
+def trained_entries() -> list[tuple[str, dict[str, Any]]]:
+    ledger = json.loads(LEDGER.read_text(encoding="utf-8"))
+    return [(digest, entry) for digest, entry in ledger.items() if "algorithm" in entry["configuration"]]
+
+
+def tuples(values: dict[str, Any]) -> dict[str, Any]:
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
+
+
+@pytest.mark.parametrize(("digest", "entry"), trained_entries(), ids=lambda part: part if isinstance(part, str) else "")
+def test_a_result_from_before_networks_could_be_chosen_is_found_again(digest: str, entry: dict[str, Any]):
+    configuration = entry["configuration"]
+    make: Callable[..., Any] = find_algorithm(configuration["algorithm"]).args
+    now = make(**tuples(configuration["hyperparameters"]))
+    assert now.network == "mlp"
+    assert identity_hash({**configuration, "hyperparameters": identifying(now)}) == digest
+    other = identity_hash({**configuration, "hyperparameters": identifying(replace(now, network="lines"))})
+    assert other != digest
