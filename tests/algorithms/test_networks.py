@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
@@ -26,6 +27,7 @@ from rl2grid.algorithms.networks import (
     NetworkFactory,
     Output,
     Request,
+    find_network,
     network_names,
     register_network,
 )
@@ -156,6 +158,17 @@ def test_names_are_given_once():
         register_network(Network("lines", Lines))
     with pytest.raises(UsageError, match="'mlp' exists already"):
         register_network(Network("mlp", Lines))
+
+
+def test_installed_packages_offer_theirs(monkeypatch: pytest.MonkeyPatch):
+    theirs = Network("theirs", Lines)
+    points = [SimpleNamespace(name="theirs", load=lambda: theirs), SimpleNamespace(name="wrong", load=lambda: Lines)]
+    monkeypatch.setattr(networks, "entry_points", lambda group: points if group == "rl2grid.networks" else [])
+    monkeypatch.setattr(networks, "_installed", networks._installed.__wrapped__)
+    assert network_names() == ("mlp", "theirs", "wrong", "lines")
+    assert find_network("theirs") is theirs
+    with pytest.raises(UsageError, match="'wrong' is offered by an entry point that is no Network"):
+        find_network("wrong")
 
 
 # --- What is asked for ----------------------------------------------------------------------------------------------

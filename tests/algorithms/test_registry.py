@@ -91,3 +91,35 @@ def test_names_are_known_without_pytorch():
     code += "; from rl2grid.cli.train import train; train(['--help']); assert 'torch' not in sys.modules"
     shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert f"({', '.join(OURS)})" in shown
+
+
+class Point:
+    """An entry point."""
+
+    def __init__(self, name: str, offered: object) -> None:
+        self.name, self.offered = name, offered
+
+    def load(self) -> object:
+        return self.offered
+
+
+@pytest.fixture
+def offered(monkeypatch: pytest.MonkeyPatch) -> list[Point]:
+    """What installed packages offer during a test."""
+    points: list[Point] = []
+    monkeypatch.setattr(registry, "entry_points", lambda group: points if group == "rl2grid.algorithms" else [])
+    monkeypatch.setattr(registry, "_installed", registry._installed.__wrapped__)
+    return points
+
+
+def test_installed_packages_offer_theirs(mine: Algorithm, offered: list[Point]):
+    theirs = replace(mine, name="theirs")
+    offered += [Point("theirs", theirs), Point("ppo", mine)]
+    assert algorithm_names() == (*OURS, "theirs", "mine")
+    assert find_algorithm("theirs") is theirs
+    assert find_algorithm("ppo").name == "ppo"  # nobody takes its place
+    with pytest.raises(UsageError, match="'theirs' exists already"):
+        register_algorithm(theirs)
+    offered.append(Point("wrong", 3))
+    with pytest.raises(UsageError, match="'wrong' is offered by an entry point that is no Algorithm, but 3"):
+        find_algorithm("wrong")

@@ -55,7 +55,7 @@ class SharedArgs:
     normalize_observations: bool = True
     """Whether observations are scaled by running statistics shared by all environments."""
     network: str = added_later("mlp")
-    """Kind of the networks, by name: ``mlp``, or one that was registered (:mod:`rl2grid.algorithms.networks`)."""
+    """Name of the kind of networks: ``mlp``, layers one after the other, or one of your own."""
     torch_threads: int = 1
     """Threads of PyTorch; results are reproducible bit by bit for a given number only."""
     device: str = "cpu"

@@ -1,14 +1,21 @@
-"""The algorithms that can be trained, by name: those of the package and whatever :func:`register_algorithm` adds.
+"""The algorithms that can be trained, by name: those of the package, those of other installed packages, and whatever
+:func:`register_algorithm` adds in this process.
 
 This module needs no PyTorch: the file of an algorithm is imported when it is first asked for, and ends in the
-:class:`Algorithm` that describes it.
+:class:`Algorithm` that describes it. A package offers its own by entry points, which every process finds, those of the
+command line and of workers too::
+
+    [project.entry-points."rl2grid.algorithms"]
+    reinforce = "my_package.reinforce:ALGORITHM"
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, get_type_hints
 
 import gymnasium
@@ -85,6 +92,13 @@ _IN_PACKAGE = {
 }
 """The file of each, whose ``ALGORITHM`` describes it."""
 _ADDED: dict[str, Algorithm] = {}
+GROUP = "rl2grid.algorithms"
+"""Of entry points."""
+
+
+@functools.cache
+def _installed() -> dict[str, EntryPoint]:
+    return {point.name: point for point in entry_points(group=GROUP) if point.name not in _IN_PACKAGE}
 
 
 def register_algorithm(algorithm: Algorithm) -> None:
@@ -93,14 +107,14 @@ def register_algorithm(algorithm: Algorithm) -> None:
     Raises:
         UsageError: the name is taken by another algorithm.
     """
-    if algorithm.name in _IN_PACKAGE or _ADDED.get(algorithm.name, algorithm) != algorithm:
+    if algorithm.name in (*_IN_PACKAGE, *_installed()) or _ADDED.get(algorithm.name, algorithm) != algorithm:
         raise UsageError(f"Algorithm {algorithm.name!r} exists already: choose another name.")
     _ADDED[algorithm.name] = algorithm
 
 
 def algorithm_names() -> tuple[str, ...]:
     """All names, those of the package first."""
-    return (*_IN_PACKAGE, *_ADDED)
+    return (*_IN_PACKAGE, *_installed(), *_ADDED)
 
 
 def find_algorithm(name: str) -> Algorithm:
@@ -108,14 +122,18 @@ def find_algorithm(name: str) -> Algorithm:
 
     Raises:
         UsageError: there is none.
-        ImportError: PyTorch is not installed.
+        ImportError: PyTorch or the package that offers it is not installed.
     """
     if name in _ADDED:
         return _ADDED[name]
-    if name not in _IN_PACKAGE:
+    if name in _IN_PACKAGE:
+        algorithm = import_module(_IN_PACKAGE[name]).ALGORITHM
+    elif name in _installed():
+        algorithm = _installed()[name].load()
+    else:
         raise one_of("Algorithm", name, algorithm_names())
-    algorithm = import_module(_IN_PACKAGE[name]).ALGORITHM
-    assert isinstance(algorithm, Algorithm)
+    if not isinstance(algorithm, Algorithm):
+        raise UsageError(f"Algorithm {name!r} is offered by an entry point that is no Algorithm, but {algorithm!r}.")
     return algorithm
 
 

@@ -123,9 +123,9 @@ class Trainer(ABC):
     def policy(self) -> tuple[nn.Module, dict[str, Any]]:
         """The network that acts, and what is needed to make it again."""
 
-    @abstractmethod
     def normalizer_state(self) -> dict[str, Any] | None:
         """The statistics that scale observations; None without normalisation."""
+        return None
 
     def policy_state(self) -> dict[str, Any]:
         """All that is needed to act: see ``load_policy``; ``normalizer`` is None without normalisation."""

@@ -2,15 +2,21 @@
 
 An algorithm asks for a network by a :class:`Request`: which task it is of, which numbers are wanted, how wide its
 layers are. Whoever answers is chosen by name, the hyperparameter ``network``; a network of one's own is a function from
-the request to a ``torch.nn.Module`` and a call of :func:`register_network`.
+the request to a ``torch.nn.Module`` and a call of :func:`register_network`, or an entry point of a package, which every
+process finds::
+
+    [project.entry-points."rl2grid.networks"]
+    graph = "my_package.graph:NETWORK"
 """
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Self
 
 import torch
@@ -122,6 +128,13 @@ class Network:
 _IN_PACKAGE = {"mlp": "rl2grid.algorithms.networks.mlp"}
 """The file of each, whose ``NETWORK`` describes it."""
 _ADDED: dict[str, Network] = {}
+GROUP = "rl2grid.networks"
+"""Of entry points."""
+
+
+@functools.cache
+def _installed() -> dict[str, EntryPoint]:
+    return {point.name: point for point in entry_points(group=GROUP) if point.name not in _IN_PACKAGE}
 
 
 def register_network(network: Network) -> None:
@@ -130,14 +143,14 @@ def register_network(network: Network) -> None:
     Raises:
         UsageError: the name is taken by another network.
     """
-    if network.name in _IN_PACKAGE or _ADDED.get(network.name, network) != network:
+    if network.name in (*_IN_PACKAGE, *_installed()) or _ADDED.get(network.name, network) != network:
         raise UsageError(f"Network {network.name!r} exists already: choose another name.")
     _ADDED[network.name] = network
 
 
 def network_names() -> tuple[str, ...]:
     """All names, those of the package first."""
-    return (*_IN_PACKAGE, *_ADDED)
+    return (*_IN_PACKAGE, *_installed(), *_ADDED)
 
 
 def find_network(name: str) -> Network:
@@ -148,10 +161,14 @@ def find_network(name: str) -> Network:
     """
     if name in _ADDED:
         return _ADDED[name]
-    if name not in _IN_PACKAGE:
+    if name in _IN_PACKAGE:
+        network = import_module(_IN_PACKAGE[name]).NETWORK
+    elif name in _installed():
+        network = _installed()[name].load()
+    else:
         raise one_of("Network", name, network_names())
-    network = import_module(_IN_PACKAGE[name]).NETWORK
-    assert isinstance(network, Network)
+    if not isinstance(network, Network):
+        raise UsageError(f"Network {name!r} is offered by an entry point that is no Network, but {network!r}.")
     return network
 
 
