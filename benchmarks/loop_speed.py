@@ -60,7 +60,7 @@ def measure(algorithm: str, task: str, heuristic: str | None, seconds: float) ->
 
 def _small(algorithm: str) -> dict[str, Any]:
     """A replay memory is sized by its bytes, not by the budget."""
-    return {"buffer_bytes": 256 * 1024**2} if algorithm in ("dqn", "sac", "td3") else {}
+    return {"buffer_bytes": 256 * 1024**2} if "buffer_bytes" in find_algorithm(algorithm).type_hints() else {}
 
 
 def main() -> None:
