@@ -10,15 +10,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
+from rl2grid.arrays import F64, I32
 from rl2grid.grids import Grid
 from rl2grid.mdp.state import GridState
 from rl2grid.powerflow.model import Network
 
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
 _LEAST_SHARE = 0.5
 """Share of a line's apparent-power limit that active power may always use, however much reactive power flows."""
 _LEAST_LOADING = 0.05

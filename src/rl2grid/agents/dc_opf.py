@@ -16,7 +16,8 @@ from rl2grid.agents.dispatch import (
     encode,
     worst_loading,
 )
-from rl2grid.agents.linear_programme import F64, Affine, Programme
+from rl2grid.agents.linear_programme import Affine, Programme
+from rl2grid.arrays import F64
 from rl2grid.mdp.heuristics import is_safe
 from rl2grid.mdp.state import GridState
 

@@ -8,13 +8,13 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from rl2grid.arrays import F64
 from rl2grid.errors import UsageError
 from rl2grid.grids import STEPS_PER_HOUR, Grid
 from rl2grid.mdp.actions import continuous_layout
 from rl2grid.mdp.state import GridState
 from rl2grid.powerflow.model import load_network
 
-F64 = NDArray[np.float64]
 _CURTAILMENT_PRICE = 10.0
 _STORAGE_PRICE = 5.0
 _REDISPATCH_PRICE = 1.0

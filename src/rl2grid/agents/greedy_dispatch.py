@@ -5,12 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rl2grid.agents.agent import Action, Info, Observation
 from rl2grid.agents.dc_flow import buses, dc_point, sensitivities
 from rl2grid.agents.dispatch import (
-    F64,
     Control,
     DispatchAgent,
     anything_dispatched,
@@ -19,11 +17,10 @@ from rl2grid.agents.dispatch import (
     encode,
     worst_loading,
 )
+from rl2grid.arrays import F64, I64
 from rl2grid.mdp.actions import continuous_layout
 from rl2grid.mdp.heuristics import is_safe
 from rl2grid.mdp.state import GridState
-
-I64 = NDArray[np.int64]
 
 _SHARES = (0.5, 1.0)
 """Of the room that both sides of a shift have: how far a candidate goes."""

@@ -11,15 +11,12 @@ from numpy.typing import NDArray
 
 from rl2grid.agents.agent import Action, Info, Observation
 from rl2grid.agents.recovery import Recovery
+from rl2grid.arrays import F64, I64, Flags
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
 from rl2grid.mdp.actions import ActionCatalogue, ActionKind, full_catalogue
 from rl2grid.mdp.heuristics import SAFE_RHO, is_safe
 from rl2grid.mdp.state import GridState
-
-F64 = NDArray[np.float64]
-Flags = NDArray[np.bool_]
-I64 = NDArray[np.int64]
 
 _NOTHING = 0
 _WORTHWHILE = 1e-3

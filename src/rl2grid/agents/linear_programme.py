@@ -10,11 +10,11 @@ from contextlib import contextmanager
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import Bounds, LinearConstraint, milp
 from scipy.sparse import csr_array
 
-F64 = NDArray[np.float64]
+from rl2grid.arrays import F64
+
 Terms = Iterable[tuple[int, float]]
 """(column, coefficient); a column may occur several times."""
 _GAP = 1e-6

@@ -8,20 +8,17 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from numpy.typing import NDArray
 
 from rl2grid.agents.agent import Action, Info, Observation
 from rl2grid.agents.dc_flow import DcPoint, buses, dc_flow, dc_point, is_connected
-from rl2grid.agents.linear_programme import F64, Affine, Programme
+from rl2grid.agents.linear_programme import Affine, Programme
+from rl2grid.arrays import F64, I32, Flags
 from rl2grid.envs.outages_after_action import busbars_after
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
 from rl2grid.mdp.actions import ActionCatalogue, ActionKind, full_catalogue, moved_elements
 from rl2grid.mdp.heuristics import is_safe
 from rl2grid.powerflow.model import load_network
-
-Flags = NDArray[np.bool_]
-I32 = NDArray[np.int32]
 
 _NOTHING = 0
 _WORTHWHILE = 1e-3

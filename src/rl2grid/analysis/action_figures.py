@@ -26,13 +26,13 @@ from rl2grid.analysis.action_space import (
     topology_after,
     wilson_interval,
 )
+from rl2grid.arrays import F64
 from rl2grid.drawing.grid_drawing import GridDrawing, add_legend, reference_scene
 from rl2grid.drawing.theme import LIGHT, Theme, style
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
 from rl2grid.grids.rankings import Trials, ranking, trials
 from rl2grid.mdp.actions import ActionKind, StepAction, describe
-from rl2grid.records.statistics import Floats
 
 MAX_POINTS = 600
 """Columns of a curve over actions: more actions are pooled."""
@@ -253,7 +253,7 @@ def _rank_pools(n: int, logarithmic: bool) -> list[NDArray[np.int64]]:
     return [np.arange(first, last) for first, last in itertools.pairwise(bounds.tolist())]
 
 
-def _pooled(values: Floats, pools: Sequence[NDArray[np.int64]]) -> Floats:
+def _pooled(values: F64, pools: Sequence[NDArray[np.int64]]) -> F64:
     """Mean of each pool over the values that are known; NaN where none is."""
     known = [values[pool][~np.isnan(values[pool])] for pool in pools]
     return np.array([pool.mean() if pool.size else np.nan for pool in known])

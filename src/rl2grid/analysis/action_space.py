@@ -9,6 +9,7 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rl2grid.arrays import F64
 from rl2grid.errors import UsageError
 from rl2grid.grids import STEPS_PER_HOUR, Grid
 from rl2grid.grids.rankings import ranking, trials
@@ -22,12 +23,12 @@ from rl2grid.mdp.actions import (
     level_ids,
     moved_elements,
 )
-from rl2grid.records.statistics import LEVEL, Floats
+from rl2grid.records.statistics import LEVEL
 
 MINUTES_PER_STEP = 60 // STEPS_PER_HOUR
 
 
-def wilson_interval(successes: ArrayLike, attempts: ArrayLike, *, level: float = LEVEL) -> tuple[Floats, Floats]:
+def wilson_interval(successes: ArrayLike, attempts: ArrayLike, *, level: float = LEVEL) -> tuple[F64, F64]:
     """Wilson's score interval of a probability, float64 low and high.
 
     Unlike the normal interval it never leaves [0, 1] and has a width where all attempts went the same way.

@@ -16,11 +16,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from rl2grid.analysis import figures
+from rl2grid.arrays import F64
 from rl2grid.drawing.grid_drawing import GridDrawing, reference_scene
 from rl2grid.drawing.theme import LIGHT, Theme, style
 from rl2grid.grids import Grid
 from rl2grid.records.episodes import Episode
-from rl2grid.records.statistics import Floats
 
 MOST = 12
 """Lines or substations drawn as bars."""
@@ -32,11 +32,11 @@ class EndingCounts:
 
     lost: int
     """Lost episodes."""
-    overloads: Floats
+    overloads: F64
     """[line] above its limit in the state before."""
-    outages: Floats
+    outages: F64
     """[line] out of service at the end."""
-    cut_off: Floats
+    cut_off: F64
     """[sub] cut off from the grid."""
 
 
@@ -132,7 +132,7 @@ def _either(episode: Episode) -> str:
     return " ".join(sorted({*episode.last_overloads.split(), *episode.last_outages.split()}, key=int))
 
 
-def _count(names: Iterable[str], n: int) -> Floats:
+def _count(names: Iterable[str], n: int) -> F64:
     counted = Counter(int(name) for text in names for name in text.split())
     return np.array([counted[k] for k in range(n)], np.float64)
 

@@ -24,6 +24,7 @@ from matplotlib.text import Annotation
 from matplotlib.ticker import FuncFormatter, PercentFormatter
 from numpy.typing import NDArray
 
+from rl2grid.arrays import F64
 from rl2grid.drawing.theme import (
     FULL_SCALE,
     GREEN,
@@ -37,7 +38,7 @@ from rl2grid.drawing.theme import (
 )
 from rl2grid.records.evaluations import Evaluation
 from rl2grid.records.recordings import Recording
-from rl2grid.records.statistics import Floats, bootstrap_band, episode_mean
+from rl2grid.records.statistics import bootstrap_band, episode_mean
 from rl2grid.records.trainings import SURVIVAL, Metric, TrainingCurve
 
 STEPS_PER_DAY = 288
@@ -244,7 +245,7 @@ def _draw_agent(axes: Axes, row: int, result: Evaluation, colour: str, theme: Th
     )
 
 
-def _draw_peak(axes: Axes, recording: Recording, time: Floats, theme: Theme) -> None:
+def _draw_peak(axes: Axes, recording: Recording, time: F64, theme: Theme) -> None:
     peak = np.where(recording.line_status, recording.rho, 0).max(axis=1)
     axes.plot(time, peak, color=theme.series[0], linewidth=0.9)
     axes.axhline(SAFE_LOADING, color=VERMILLION, linewidth=0.9, linestyle=(0, (4, 2)))
@@ -344,7 +345,7 @@ def _highest(loading: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.where(np.isinf(highest), np.nan, highest).astype(np.float32)
 
 
-def _spread(values: Floats) -> Floats:
+def _spread(values: F64) -> F64:
     """Heights in [0, 1] that keep dots with near values apart: the golden ratio's sequence in order of value."""
     heights = np.empty(len(values))
     heights[np.argsort(values, kind="stable")] = (np.arange(len(values)) * 0.6180339887) % 1.0

@@ -13,15 +13,16 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
+from rl2grid.arrays import F64
 from rl2grid.records.episodes import Episode
-from rl2grid.records.statistics import LEVEL, Floats
+from rl2grid.records.statistics import LEVEL
 
 
 @dataclass(frozen=True, eq=False)
 class Lifetimes:
     """How long each episode lived."""
 
-    steps: Floats
+    steps: F64
     """float64 [episode] grid steps survived."""
     failed: np.ndarray[tuple[int], np.dtype[np.bool_]]
     """bool [episode] whether it was lost then; else it was completed, and would have lived longer."""
@@ -31,13 +32,13 @@ class Lifetimes:
 class SurvivalCurve:
     """The Kaplan-Meier estimate: a staircase that falls at ``steps``."""
 
-    steps: Floats
+    steps: F64
     """float64 [fall], 0 first."""
-    alive: Floats
+    alive: F64
     """Share of grids alive after each of them."""
-    low: Floats
-    high: Floats
-    censored: Floats
+    low: F64
+    high: F64
+    censored: F64
     """float64 [episode] steps at which completed episodes leave."""
 
     @property
@@ -83,7 +84,7 @@ def _censored(lived: Lifetimes) -> stats.CensoredData:
     return stats.CensoredData(uncensored=lived.steps[lived.failed], right=lived.steps[~lived.failed])
 
 
-def _carried(values: Floats) -> Floats:
+def _carried(values: F64) -> F64:
     """Values with the last known one in the place of those that are not defined."""
     known = np.maximum.accumulate(np.where(np.isnan(values), 0, np.arange(len(values))))
     return np.asarray(values[known])

@@ -22,6 +22,7 @@ from rich.table import Table
 
 from rl2grid.analysis import page
 from rl2grid.analysis.figures import png_bytes
+from rl2grid.arrays import F64
 from rl2grid.drawing.theme import DARK, LIGHT, Theme, style
 from rl2grid.errors import UsageError
 from rl2grid.grids import STEPS_PER_HOUR, Grid
@@ -29,8 +30,6 @@ from rl2grid.scenarios.generated import MONTHS, VERSION, generator_fingerprint, 
 from rl2grid.scenarios.generator.security import assess
 from rl2grid.scenarios.library import list_scenarios, load_scenario
 from rl2grid.scenarios.scenario import STEP, Scenario
-
-Floats = NDArray[np.float64]
 
 SOURCES = ("bundled", "generated")
 ROWS_PER_DAY = 24 * STEPS_PER_HOUR
@@ -75,7 +74,7 @@ class Sample:
     scenario_id: str
     first_row: int
     """Row of its day in which it begins."""
-    values: Mapping[str, Floats]
+    values: Mapping[str, F64]
     """By key of a quantity; empty where the grid has nothing of the kind."""
 
 
@@ -88,7 +87,7 @@ class Comparison:
     """Of the generator."""
     samples: tuple[Sample, ...]
 
-    def values(self, source: str, key: str) -> Floats:
+    def values(self, source: str, key: str) -> F64:
         """All values of a quantity."""
         return np.concatenate([each.values[key] for each in self.of(source)])
 
@@ -142,7 +141,7 @@ def compare(grid: Grid, samples: Sequence[Sample]) -> Comparison:
     return Comparison(grid.id, generator_fingerprint(grid), tuple(samples))
 
 
-def autocorrelation(series: Sequence[Floats]) -> tuple[NDArray[np.int64], Floats]:
+def autocorrelation(series: Sequence[F64]) -> tuple[NDArray[np.int64], F64]:
     """Correlation of a quantity with itself later, pooled over series around their common mean.
 
     Args:
@@ -163,7 +162,7 @@ def autocorrelation(series: Sequence[Floats]) -> tuple[NDArray[np.int64], Floats
     return np.array(lags), np.array(correlations)
 
 
-def distance(one: Floats, other: Floats) -> float:
+def distance(one: F64, other: F64) -> float:
     """Largest difference of two distributions (Kolmogorov and Smirnov), 0 to 1."""
     points = np.concatenate([one, other])
     shares = [np.searchsorted(np.sort(values), points, side="right") / len(values) for values in (one, other)]
@@ -234,21 +233,21 @@ def _months_of(scenario: Scenario) -> set[int]:
     return {min((first + day) % 365 // _MONTH_DAYS, MONTHS - 1) for day in range(days)}
 
 
-def _total(array: NDArray[np.float32]) -> Floats:
+def _total(array: NDArray[np.float32]) -> F64:
     return _decimal(array.astype(np.float64).sum(axis=1))
 
 
-def _ramps(values: Floats) -> Floats:
+def _ramps(values: F64) -> F64:
     return _decimal(np.diff(values))
 
 
-def _decimal(values: Floats) -> Floats:
+def _decimal(values: F64) -> F64:
     """Series are decimals, which sums and differences of binary fractions only come close to."""
-    rounded: Floats = np.round(values, 3)
+    rounded: F64 = np.round(values, 3)
     return rounded
 
 
-def _hourly_flow(grid: Grid, scenario: Scenario) -> dict[str, Floats]:
+def _hourly_flow(grid: Grid, scenario: Scenario) -> dict[str, F64]:
     load_p, load_q, prod_p = (
         np.rint(10.0 * array[::STEPS_PER_HOUR].astype(np.float64)).astype(np.int32)
         for array in (scenario.load_p, scenario.load_q, scenario.prod_p)
@@ -264,7 +263,7 @@ def _hourly_flow(grid: Grid, scenario: Scenario) -> dict[str, Floats]:
     }
 
 
-def _correlation(series: Sequence[Floats], lag: int) -> float:
+def _correlation(series: Sequence[F64], lag: int) -> float:
     lags, correlations = autocorrelation(series)
     found = np.flatnonzero(lags == lag)
     return float(correlations[found[0]]) if len(found) else float("nan")
@@ -396,8 +395,8 @@ def _shown(comparison: Comparison) -> list[Quantity]:
     return [quantity for quantity in comparison.quantities if quantity.key in CORRELATED]
 
 
-def _in_hour(sample: Sample, key: str, hour: int) -> Floats:
+def _in_hour(sample: Sample, key: str, hour: int) -> F64:
     values = sample.values[key]
     hours = (sample.first_row + np.arange(len(values))) % ROWS_PER_DAY // STEPS_PER_HOUR
-    chosen: Floats = values[hours == hour]
+    chosen: F64 = values[hours == hour]
     return chosen

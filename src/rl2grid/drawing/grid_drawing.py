@@ -38,14 +38,13 @@ from matplotlib.textpath import TextPath
 from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
+from rl2grid.arrays import I32, Flags
 from rl2grid.drawing import theme as themes
 from rl2grid.drawing.theme import FULL_SCALE, GREEN, LIGHT, PURPLE, Theme, style
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
 
 Points = NDArray[np.float64]
-Ints = NDArray[np.int32]
-Flags = NDArray[np.bool_]
 
 HIGHLIGHT = "#F0E442"
 """Yellow of Okabe and Ito: behind what a picture is about, as with a text marker."""
@@ -69,7 +68,7 @@ _SENTENCE_LENGTH = 170
 class Scene:
     """What a picture shows of a grid."""
 
-    topo_vect: Ints
+    topo_vect: I32
     """[topo] busbar of each element, 1 or 2; -1 when disconnected."""
     rho: NDArray[np.float32]
     """[line] loading; NaN where it is not known."""
@@ -136,7 +135,7 @@ class Geometry:
     """[sub, 2]"""
     symbol: Points
     """[generators, loads, storages; 2]"""
-    symbol_element: Ints
+    symbol_element: I32
     """[symbol] entry of ``topo_vect``."""
     line_middle: Points
     """[line, 2, 2] where a line begins and ceases to run beside its parallels."""
@@ -191,7 +190,7 @@ def _line_middles(grid: Grid, centre: Points, unit: float) -> Points:
     return np.stack((near, far), axis=1)
 
 
-def _place_symbols(grid: Grid, centre: Points, unit: float, sub: Ints) -> Points:
+def _place_symbols(grid: Grid, centre: Points, unit: float, sub: I32) -> Points:
     """Each symbol around its substation where most room is, one after the other."""
     angle = np.arange(_DIRECTIONS) * 2 * np.pi / _DIRECTIONS
     ring = np.stack((np.cos(angle), np.sin(angle)), axis=1) * _SYMBOL_DISTANCE * unit
@@ -275,7 +274,7 @@ class GridDrawing:
         self._show_highlights(scene)
         self._show_symbols(scene)
 
-    def _route(self, topo_vect: Ints) -> None:
+    def _route(self, topo_vect: I32) -> None:
         """Lead every element to its busbar."""
         geometry, grid = self._geometry, self._grid
         self._topo_vect = topo_vect.copy()
@@ -311,12 +310,12 @@ class GridDrawing:
         along = centre[grid.line_or_to_subid[line[0]]] - centre[grid.line_ex_to_subid[line[0]]]
         return 0.5 * float(np.linalg.norm(along)) / self.unit
 
-    def _split(self, topo_vect: Ints) -> Flags:
+    def _split(self, topo_vect: I32) -> Flags:
         """[sub] whether anything is on busbar 2."""
         on_second = np.bincount(self._grid.element_to_subid, topo_vect == 2, self._grid.n_sub)
         return np.asarray(on_second > 0)
 
-    def _ends(self, topo_vect: Ints, split: Flags) -> tuple[Points, Points]:
+    def _ends(self, topo_vect: I32, split: Flags) -> tuple[Points, Points]:
         """Where each element ends at its substation, and the point before: round the end of the bar in between."""
         geometry, sub = self._geometry, self._grid.element_to_subid
         centre, towards = geometry.centre[sub], geometry.towards

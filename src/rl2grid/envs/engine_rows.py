@@ -8,6 +8,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from rl2grid.arrays import I64
 from rl2grid.envs.description import check_action
 from rl2grid.envs.environments import Environments, StreamPosition
 from rl2grid.envs.info import batch_info
@@ -18,7 +19,6 @@ from rl2grid.errors import UsageError
 from rl2grid.mdp.features import observation_size
 from rl2grid.scenarios.episodes import EpisodePlan
 
-I64 = NDArray[np.int64]
 Decisions = TypeVar("Decisions")
 """Checked actions of all rows, in the form in which the engine takes them."""
 

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rl2grid.envs.engine_rows import I64, EngineRows
+from rl2grid.arrays import I64
+from rl2grid.envs.engine_rows import EngineRows
 from rl2grid.mdp.actions import StepAction
 from rl2grid.scenarios.episodes import EpisodePlan
 

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rl2grid.arrays import I64
 from rl2grid.engines.native.transitions import Commands, NativeTransitions
-from rl2grid.envs.engine_rows import I64, EngineRows
+from rl2grid.envs.engine_rows import EngineRows
 from rl2grid.envs.options import TaskOptions
 from rl2grid.envs.tasks import Task
 from rl2grid.mdp.actions import ActionKind

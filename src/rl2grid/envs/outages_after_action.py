@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rl2grid.arrays import I32
 from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.engines.native.what_if import OutageOutcomes, WhatIf, forecast_of
 from rl2grid.grids import Grid
 from rl2grid.mdp.actions import ActionKind, StepAction, moved_elements
 from rl2grid.mdp.termination import GameOver
-
-I32 = NDArray[np.int32]
 
 
 def outages_after(engine: NativeEngine, i: int, action: StepAction, solver: WhatIf) -> OutageOutcomes:

@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium.vector import VectorWrapper
 from numpy.typing import NDArray
 
-Flags = NDArray[np.bool_]
+from rl2grid.arrays import Flags
 
 
 class SafetyTuple(gymnasium.Wrapper[Any, Any, Any, Any]):

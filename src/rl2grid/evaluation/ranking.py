@@ -43,6 +43,7 @@ import platformdirs
 from numpy.typing import NDArray
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from rl2grid.arrays import F32, F64, I32, Flags
 from rl2grid.compile import cache_directory
 from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.engines.native.what_if import WhatIf, snapshot_of
@@ -76,11 +77,6 @@ _COVERED, _WORTHWHILE = 0.9, 0.02
 _TRUST, _RELIEF_WEIGHT = 0.7, 0.001
 _CHUNK = 4096  # actions whose statistics are computed at once
 _UNTRIED = np.float16(np.nan)
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
-Flags = NDArray[np.bool_]
 
 
 class Trials(NamedTuple):

@@ -16,8 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Floats = NDArray[np.float64]
-Statistic = Callable[[Floats], Floats]
+from rl2grid.arrays import F64
+
+Statistic = Callable[[F64], F64]
 """Maps float64 [..., result] to float64 [...]."""
 
 RESAMPLES = 2000
@@ -52,7 +53,7 @@ class Unit(enum.Enum):
 class Scores:
     """A figure of every episode of one method, such as its survival."""
 
-    values: Floats
+    values: F64
     """float64 [run, scenario, seed]; one run where nothing was trained."""
 
     def __post_init__(self) -> None:
@@ -68,11 +69,11 @@ class Scores:
         return Unit.RUN if runs > 1 else Unit.SEED if seeds > 1 else Unit.SCENARIO
 
     @property
-    def by_scenario(self) -> Floats:
+    def by_scenario(self) -> F64:
         """float64 [scenario, repetition], run by run."""
         return np.asarray(np.moveaxis(self.values, 0, 1).reshape(self.values.shape[1], -1))
 
-    def resampled(self, unit: Unit, resamples: int = RESAMPLES, seed: int = 0) -> Floats:
+    def resampled(self, unit: Unit, resamples: int = RESAMPLES, seed: int = 0) -> F64:
         """float64 [resample, scenario, repetition], ``unit`` drawn with replacement."""
         runs, scenarios, seeds = self.values.shape
         if unit is Unit.RUN:
@@ -85,26 +86,26 @@ class Scores:
         return np.asarray(flat[_draw(members, resamples, seed)].reshape(resamples, scenarios, -1))
 
 
-Aggregate = Callable[[Floats], Floats]
+Aggregate = Callable[[F64], F64]
 """Maps float64 [..., scenario, repetition] to float64 [...], or [..., threshold]."""
 
 
-def mean_score(scores: Floats) -> Floats:
+def mean_score(scores: F64) -> F64:
     """Mean over scenarios and repetitions."""
     return np.asarray(scores.mean(axis=(-2, -1)))
 
 
-def iqm_score(scores: Floats) -> Floats:
+def iqm_score(scores: F64) -> F64:
     """Interquartile mean over scenarios and repetitions together."""
     return interquartile_mean(scores.reshape(*scores.shape[:-2], -1))
 
 
-def median_score(scores: Floats) -> Floats:
+def median_score(scores: F64) -> F64:
     """Median over scenarios of the mean over repetitions."""
     return np.asarray(np.median(scores.mean(axis=-1), axis=-1))
 
 
-def optimality_gap(scores: Floats, target: float = 1.0) -> Floats:
+def optimality_gap(scores: F64, target: float = 1.0) -> F64:
     """What is missing to ``target`` on average; what exceeds it does not make up for what is missing elsewhere."""
     return np.asarray(target - np.minimum(scores, target).mean(axis=(-2, -1)))
 
@@ -113,7 +114,7 @@ def share_above(thresholds: ArrayLike) -> Aggregate:
     """The performance profile: share of all scores above each of the thresholds [threshold]."""
     levels = np.asarray(thresholds, np.float64)
 
-    def share(scores: Floats) -> Floats:
+    def share(scores: F64) -> F64:
         flat = np.sort(scores.reshape(*scores.shape[:-2], -1), axis=-1)
         rows = flat.reshape(-1, flat.shape[-1])
         above = np.stack([row.size - np.searchsorted(row, levels, side="right") for row in rows])
@@ -137,7 +138,7 @@ def estimate(
 
 def score_band(
     scores: Scores, aggregate: Aggregate, *, resamples: int = RESAMPLES, level: float = LEVEL, seed: int = 0
-) -> tuple[Floats, Floats, Floats]:
+) -> tuple[F64, F64, F64]:
     """:func:`estimate` of an aggregate with several values, such as :func:`share_above`: value, low and high."""
     samples = aggregate(scores.resampled(scores.unit, resamples, seed))
     low, high = np.quantile(samples, [(1 - level) / 2, (1 + level) / 2], axis=0)
@@ -169,7 +170,7 @@ def probability_of_improvement(
     return Estimate(float(wins.mean()), float(low), float(high))
 
 
-def _weights(scores: Scores, resamples: int, seed: int) -> Floats:
+def _weights(scores: Scores, resamples: int, seed: int) -> F64:
     """Share of each repetition in each resample, float64 [resample, scenario, repetition]; equal if there is one."""
     runs, scenarios, seeds = scores.values.shape
     repetitions = runs * seeds
@@ -181,12 +182,12 @@ def _weights(scores: Scores, resamples: int, seed: int) -> Floats:
     return np.stack([(drawn == k).mean(axis=-1) for k in range(repetitions)], axis=-1)
 
 
-def mean(values: Floats) -> Floats:
+def mean(values: F64) -> F64:
     """Mean over the last axis."""
     return np.asarray(values.mean(axis=-1))
 
 
-def interquartile_mean(values: Floats) -> Floats:
+def interquartile_mean(values: F64) -> F64:
     """Mean over the last axis of what is left without the lowest and the highest quarter (rounded down)."""
     n = values.shape[-1]
     cut = n // 4
@@ -232,7 +233,7 @@ def stratified_bootstrap(
 
 def bootstrap_band(
     curves: ArrayLike, *, resamples: int = RESAMPLES, level: float = LEVEL, seed: int = 0
-) -> tuple[Floats, Floats, Floats]:
+) -> tuple[F64, F64, F64]:
     """Mean of several runs' curves, with the pointwise percentile interval over runs.
 
     Args:
@@ -253,7 +254,7 @@ def bootstrap_band(
     return results.mean(axis=0), low, high
 
 
-def episode_mean(values: ArrayLike, episodes: ArrayLike, window: int) -> Floats:
+def episode_mean(values: ArrayLike, episodes: ArrayLike, window: int) -> F64:
     """Mean over the last ``window`` episodes at each point of a curve whose points are means over several.
 
     Args:

@@ -9,16 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from rl2grid.arrays import F64
 from rl2grid.mdp.constraints import THRESHOLDS
 from rl2grid.records.episodes import Episode
-from rl2grid.records.statistics import (
-    Estimate,
-    Floats,
-    Statistic,
-    interquartile_mean,
-    mean,
-    stratified_bootstrap,
-)
+from rl2grid.records.statistics import Estimate, Statistic, interquartile_mean, mean, stratified_bootstrap
 
 
 @dataclass(frozen=True)
@@ -101,7 +95,7 @@ def summarise(episodes: Sequence[Episode]) -> Summary:
     )
 
 
-def by_scenario(episodes: Sequence[Episode], column: str) -> Floats:
+def by_scenario(episodes: Sequence[Episode], column: str) -> F64:
     """A column of the episodes, float64 [scenario, seed].
 
     Raises:
@@ -117,7 +111,7 @@ def by_scenario(episodes: Sequence[Episode], column: str) -> Floats:
     return values.reshape(n_scenarios, n_seeds)
 
 
-def safe_episodes(episodes: Sequence[Episode], limits: Mapping[str, float]) -> Floats:
+def safe_episodes(episodes: Sequence[Episode], limits: Mapping[str, float]) -> F64:
     """Whether episodes were completed within all limits, 0 or 1, float64 [scenario, seed]: dying early is not safety.
 
     Args:
@@ -133,7 +127,7 @@ def safe_episodes(episodes: Sequence[Episode], limits: Mapping[str, float]) -> F
     return safe.astype(np.float64)
 
 
-def _estimate(values: Floats, statistic: Statistic) -> Estimate:
+def _estimate(values: F64, statistic: Statistic) -> Estimate:
     """A statistic of values [scenario, seed] and its interval; see :class:`Summary`."""
     n_scenarios, n_seeds = values.shape
     strata = np.repeat(np.arange(n_scenarios), n_seeds).tolist() if n_seeds > 1 else None

@@ -11,11 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rl2grid.arrays import F64
 from rl2grid.errors import UsageError
-
-Floats = NDArray[np.float64]
 
 SURVIVAL, VALIDATION = "charts/survival", "validation/survival"
 """Names of the metrics: mean over the episodes that ended in an iteration, and on the validation scenarios."""
@@ -28,10 +26,10 @@ _COLUMNS = ("step", "grid_steps", "name", "value")
 class Metric:
     """One figure of a run against its budget, float64 [point] each."""
 
-    decisions: Floats
-    grid_steps: Floats
-    values: Floats
-    episodes: Floats
+    decisions: F64
+    grid_steps: F64
+    values: F64
+    episodes: F64
     """Episodes that ended since the point before: what the value is the mean of, where it is of episodes."""
 
 

@@ -16,17 +16,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rl2grid.arrays import U8
+from rl2grid.arrays import I16, U8
 from rl2grid.compile import jit
 from rl2grid.errors import UsageError
 from rl2grid.grids import load_grid
 from rl2grid.scenarios.generator.calendar import MONTH_ROWS
 from rl2grid.scenarios.generator.constants import load_constants
 from rl2grid.scenarios.generator.month import RawMonth
-
-I16 = NDArray[np.int16]
 
 FORMAT = "rl2grid-pack-1"
 SUFFIX = ".pack"

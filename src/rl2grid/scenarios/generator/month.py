@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rl2grid.arrays import I16
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
 from rl2grid.scenarios.generator.calendar import MONTH_ROWS, MONTH_STEPS, MONTHS, month_start
@@ -16,8 +17,6 @@ from rl2grid.scenarios.generator.constants import load_constants
 from rl2grid.scenarios.generator.forecast import make_forecasts
 from rl2grid.scenarios.generator.year import generate_year
 from rl2grid.scenarios.scenario import Scenario
-
-I16 = NDArray[np.int16]
 
 
 class RawMonth(NamedTuple):

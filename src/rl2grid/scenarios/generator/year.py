@@ -12,9 +12,8 @@ import functools
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rl2grid.arrays import I32, I64
+from rl2grid.arrays import I16, I32, I64
 from rl2grid.compile import jit
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
@@ -25,8 +24,6 @@ from rl2grid.scenarios.generator.dispatch import Market, dispatch, new_market
 from rl2grid.scenarios.generator.draws import Portion
 from rl2grid.scenarios.generator.renewables import new_weather, renewable_production
 from rl2grid.scenarios.generator.security import assess
-
-I16 = NDArray[np.int16]
 
 MAX_SEED = 2**63 - 1
 LONGEST_HORIZON = ROWS_PER_HOUR
