@@ -54,7 +54,7 @@ at thousands of files takes longer than to play an episode."""
 TRAINING_PACK_BYTES = 2 * 2**30
 """Packs of a grid's training years beyond this are removed, oldest first."""
 
-_POWER_FLOW = ("ac", "bits", "borrowing", "factors", "flow_state", "model", "newton", "ordering", "topology")
+_POWER_FLOW = ("ac", "bits", "factors", "flow_state", "model", "newton", "ordering", "topology")
 """Modules of :mod:`rl2grid.powerflow` that decide what is generated."""
 
 _NAME = re.compile(r"(?P<seed>0|[1-9]\d{0,18})-(?P<month>\d\d)(\+(?P<next>\d\d))?")
