@@ -5,22 +5,146 @@ Importing the package registers the tasks with Gymnasium::
     import gymnasium, rl2grid
     env = gymnasium.make("rl2grid/bus14-T0-v0", heuristic="idle")
 
-A trained policy comes back with :func:`load`.
+:func:`tasks` lists them, :func:`train` trains an agent, :func:`load` brings its policy back, and :func:`evaluate` plays
+the episodes by which agents are compared.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rl2grid.envs.registration import register_all
 
 if TYPE_CHECKING:
+    from rl2grid.agents.agent import Agent
     from rl2grid.algorithms.policy_agent import PolicyAgent
+    from rl2grid.envs.tasks import Task
+    from rl2grid.records.evaluations import Evaluation
 
+__all__ = ["evaluate", "load", "tasks", "train"]
 __version__ = "0.1.0"
 
 register_all()
+
+# What the functions need is imported when they are called: environments do without PyTorch and the compiled engine.
+
+
+def tasks(grid: str | None = None) -> dict[str, Task]:
+    """All tasks by id, in the order in which ``rl2grid tasks`` prints them.
+
+    Args:
+        grid: Id of a grid, such as ``"bus14"``: its tasks only.
+
+    Raises:
+        UsageError: there is no such grid.
+    """
+    from rl2grid.envs.tasks import all_tasks
+    from rl2grid.errors import one_of
+
+    every = all_tasks()
+    if grid is None:
+        return dict(every)
+    chosen = {task_id: task for task_id, task in every.items() if task.grid_id == grid}
+    if not chosen:
+        raise one_of("Grid", grid, tuple(dict.fromkeys(task.grid_id for task in every.values())))
+    return chosen
+
+
+def train(
+    algorithm: str,
+    task: Task | str,
+    *,
+    folder: str | Path | None = None,
+    preset: str = "default",
+    hyperparameters: Mapping[str, Any] | None = None,
+    validation_months: int | None = None,
+    evaluate_every: int = 50_000,
+    progress: bool = True,
+    **options: Any,
+) -> Path:
+    """Train an agent from the beginning and return its run folder, which :func:`load` and :func:`evaluate` take.
+
+    ``rl2grid train`` does the same, and ``rl2grid train --resume FOLDER`` goes on with a run that was interrupted.
+
+    Args:
+        algorithm: ``"ppo"``, ``"lagrangian-ppo"``, ``"dqn"``, ``"sac"`` or ``"td3"``.
+        task: The task or its id; the namespace and the version of an id may be left out.
+        folder: Where the run is written, a folder that does not exist yet; None: ``runs/<task>-<algorithm>-<seed>``.
+        preset: Where the hyperparameters come from that are not given.
+        hyperparameters: Of the algorithm, such as ``{"total_timesteps": 100_000, "seed": 1}``.
+        validation_months: Validation months that pick the best policy, evenly spread; None: all, 0: none.
+        evaluate_every: Decisions between two validations; there is one more at the end.
+        progress: Whether to show a progress bar.
+        options: Keywords of ``gymnasium.make``, such as ``heuristic`` or ``reward``.
+
+    Raises:
+        UsageError: the request cannot be met; nothing was written.
+        ImportError: PyTorch is not installed.
+    """
+    from rl2grid.envs.tasks import find_task
+    from rl2grid.training import runs
+    from rl2grid.training.validation import find_validator
+
+    task_id = find_task(task).id
+    args = runs.RunArgs(
+        task=task_id,
+        hyperparameters=runs.hyperparameters(algorithm, task_id, preset, **(hyperparameters or {})),
+        algorithm=algorithm,
+        folder=None if folder is None else Path(folder),
+        env_keywords=options,
+        evaluate_every=evaluate_every,
+        validation_months=validation_months,
+        progress=progress,
+    )
+    return runs.train(args, evaluate=find_validator(args))
+
+
+def evaluate(
+    agent: str | Path | Agent,
+    task: Task | str,
+    *,
+    split: str = "validation",
+    scenarios: Sequence[str] | None = None,
+    seeds: Sequence[int] = (0,),
+    output: str | Path | None = None,
+    progress: bool = False,
+    **options: Any,
+) -> Evaluation:
+    """Play every month of a split with every seed; ``rl2grid evaluate`` does the same.
+
+    Args:
+        agent: Name of an agent without training, such as ``"greedy"``, the path of a run folder or checkpoint, or an
+            agent that is not bound to an environment yet.
+        task: The task or its id; the namespace and the version of an id may be left out.
+        split: ``"validation"`` to choose by, ``"test"`` for the last number, ``"train"`` or ``"bundled"``.
+        scenarios: Play these months only; None: all of the split.
+        seeds: Of maintenance, opponent and agent: episodes per month.
+        output: Folder to store the evaluation in, and to go on with; None: nothing is stored.
+        progress: Whether to show a progress bar.
+        options: Keywords of ``gymnasium.make``, such as ``heuristic`` (by default the one that a policy was trained
+            with), and further ones of :func:`rl2grid.evaluation.protocol.evaluate`.
+
+    Returns:
+        One row per episode in ``episodes``, and their means with intervals in ``summary``.
+
+    Raises:
+        UsageError: the request cannot be met, or ``output`` holds another evaluation; nothing was written.
+    """
+    from rl2grid.envs.tasks import find_task
+    from rl2grid.evaluation import protocol
+
+    return protocol.evaluate(
+        agent,
+        find_task(task).id,
+        split=split,
+        scenarios=scenarios,
+        seeds=seeds,
+        output=None if output is None else Path(output),
+        progress=progress,
+        **options,
+    )
 
 
 def load(run: str | Path, *, deterministic: bool = True) -> PolicyAgent:
@@ -34,7 +158,6 @@ def load(run: str | Path, *, deterministic: bool = True) -> PolicyAgent:
         UsageError: there is no checkpoint, or it cannot be read.
         ImportError: PyTorch is not installed.
     """
-    # Imported here: environments and agents without training do without PyTorch.
     from rl2grid.algorithms.policy_agent import load_agent
 
     return load_agent(Path(run), deterministic=deterministic)
