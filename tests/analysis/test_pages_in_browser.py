@@ -10,7 +10,7 @@ from headless_browser import DESK, PHONE, visiting
 from sample_results import curve, result
 from test_watching import made_up
 
-from rl2grid.analysis.results_page import write_results_page
+from rl2grid.analysis.report import write_report
 from rl2grid.analysis.watch_page import write_watch_page
 from rl2grid.grids import load_grid
 from rl2grid.records.collection import Collection
@@ -33,7 +33,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     run = TrainingRun(Path("runs/one"), "rl2grid/bus14-T0-v0", {}, 1, curve())
     path = tmp_path_factory.mktemp("page") / "report.html"
     command = "rl2grid report " + " ".join(f"a-folder-{k}" for k in range(20))
-    write_results_page(
+    write_report(
         path, Collection(results, [run]), title="Some results", command=command, train_commands={run.folder: "train"}
     )
     return path

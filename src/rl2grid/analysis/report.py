@@ -1,179 +1,170 @@
-"""A report: one self-contained HTML page, the same table as Markdown, and the figures as files.
+"""A report: everything that some evaluations and training runs allow, as one HTML page.
 
-::
-
-    report.html      the page: no other file and no network needed, for phones and desks, light and dark
-    results.md       the table
-    figures/         every figure as PNG and PDF
+A ranking of every task, all tables and figures of a results section, a table of episodes to sort and filter, and the
+command behind every number.
 """
 
 from __future__ import annotations
 
 import html
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
-from matplotlib.figure import Figure
-
-from rl2grid.analysis import figures, summary_table
-from rl2grid.analysis.page import (
-    cell_html,
-    code_html,
-    commands_html,
-    facts_html,
-    figure_html,
-    identities_html,
-    scrolling,
-    table_html,
-    write_page,
-)
-from rl2grid.drawing.theme import DARK, LIGHT, Theme
-from rl2grid.records.evaluations import Evaluation, check_comparable
-from rl2grid.records.files import make_folder, write_text
-from rl2grid.records.recordings import Recording
-from rl2grid.records.summary import Summary
-from rl2grid.records.trainings import TrainingCurve
-
-REPORT_FILE, TABLE_FILE, FIGURES_FOLDER = "report.html", "results.md", "figures"
-
-
-@dataclass(frozen=True)
-class _Picture:
-    """A figure that can be drawn in any theme."""
-
-    name: str
-    caption: str
-    command: str
-    draw: Callable[[Theme], Figure]
+from rl2grid.analysis.explorer import explorer_html
+from rl2grid.analysis.page import commands_html, result_table_html
+from rl2grid.analysis.page_builder import MAX_BYTES, PageBuilder
+from rl2grid.analysis.result_tables import Methods, ranking, ranking_table
+from rl2grid.analysis.section import Section, plan_section
+from rl2grid.records.collection import Collection
+from rl2grid.records.evaluations import Evaluation
+from rl2grid.records.methods import Method, method_label
+from rl2grid.records.trainings import TrainingRun
 
 
 def write_report(
-    folder: Path,
-    results: Sequence[Evaluation],
+    path: Path,
+    collection: Collection,
     *,
     title: str,
-    introduction: str = "",
-    curves: Sequence[TrainingCurve] = (),
-    recordings: Sequence[Recording] = (),
-    commands: Mapping[str, str] | None = None,
-) -> Path:
-    """Write a report and return the path of its page.
+    command: str,
+    train_commands: Mapping[Path, str],
+    on_figure: Callable[[str], None] = lambda name: None,
+    max_bytes: int = MAX_BYTES,
+    plan: Section | None = None,
+) -> int:
+    """Write the page, whole or not at all, and return its size in bytes.
 
     Args:
-        folder: made if need be; files of an earlier report are replaced.
-        results: evaluations of one task, at least one; agents appear in this order in the table.
-        title: headline of the page.
-        introduction: a sentence or two below it.
-        curves: training runs; none: no training curve.
-        recordings: episodes to be shown line by line.
-        commands: what was typed, by what it made, beside the commands of the evaluations; ``training`` and
-            ``episodes`` also stand under their figures.
+        path: of the page, in a folder that exists.
+        collection: evaluations and runs.
+        title: headline.
+        command: what was typed to obtain the page.
+        train_commands: what was typed to obtain each run, by its folder.
+        on_figure: told the name of every figure before it is drawn.
+        max_bytes: what the page may have; the resolution of the figures is lowered until it fits, within reason.
+        plan: of this collection, where :func:`plan_section` made it already; None: it is made.
 
     Raises:
-        UsageError: no results, or results that do not belong into one table.
+        UsageError: nothing is given, or results or runs that do not belong together; nothing was written.
     """
-    check_comparable(results)
-    commands = dict(commands or {})
-    summaries = [result.summary for result in results]
-    pictures = _pictures(results, curves, recordings, commands)
-    make_folder(folder / FIGURES_FOLDER)
-    drawn = []
-    for picture in pictures:
-        light = picture.draw(LIGHT)
-        figures.save_figure(light, folder / FIGURES_FOLDER / picture.name)
-        dark = figures.png_bytes(picture.draw(DARK))
-        drawn.append(figure_html(picture.caption, figures.png_bytes(light), dark, code_html(picture.command)))
-    write_text(folder / TABLE_FILE, f"# {title}\n\n{summary_table.markdown_table(summaries)}\n{summary_table.LEGEND}\n")
-    body = [
-        _header(title, introduction, summaries),
-        f"<section><h2>Results</h2>{_table_html(summaries)}"
-        f"<p class=note>{html.escape(summary_table.LEGEND)}</p></section>",
-        *drawn,
-        _endings_html(summaries),
-        _commands_html(results, commands),
-        identities_html([(result.summary.agent, result.identity) for result in results]),
+    section = plan or plan_section(collection.evaluations, collection.runs)
+    page = PageBuilder(title, on_figure=on_figure, max_bytes=max_bytes)
+    page.add_header(_facts(collection, section.methods), places=_menu(section.methods), style=_STYLE)
+    page.add_section("What is missing", _missing(collection.missing))
+    page.add_section("Ranking", _rankings(section.methods, collection.evaluations), "ranking")
+    page.add(*_tables(section))
+    page.add_figures(section.pictures, lambda picture: _made_by(picture.task), heading=True)
+    if collection.evaluations:
+        page.add(explorer_html(collection.evaluations, _places("e", collection.evaluations)))
+    page.add_section("What made every number", _commands(collection, command, train_commands), "commands")
+    page.add_identities([(_name(result), result.identity) for result in collection.evaluations])
+    return page.write(path)
+
+
+def _facts(collection: Collection, methods: Methods) -> list[tuple[str, str]]:
+    episodes = sum(len(result.episodes) for result in collection.evaluations)
+    tasks = {*methods, *(run.task for run in collection.runs)}
+    labels = {method.label for group in methods.values() for method in group}
+    return [
+        ("tasks", f"{len(tasks)}"),
+        ("methods", f"{len(labels)}"),
+        ("training runs", f"{len(collection.runs)}"),
+        ("episodes", f"{episodes:,}"),
     ]
-    write_page(folder / REPORT_FILE, title, body)
-    return folder / REPORT_FILE
 
 
-def _pictures(
-    results: Sequence[Evaluation],
-    curves: Sequence[TrainingCurve],
-    recordings: Sequence[Recording],
-    commands: Mapping[str, str],
-) -> list[_Picture]:
-    pictures = [
-        _Picture(
-            "survival",
-            "Survival of every evaluated episode, with mean and 95% interval.",
-            "",
-            lambda theme: figures.survival_by_agent(results, theme=theme),
+def _menu(methods: Methods) -> dict[str, str]:
+    """Words of the links by place."""
+    places = {"ranking": "Ranking", "tables": "Tables", "figures": "Figures", "episodes": "Episodes"}
+    if not methods:
+        places = {"figures": "Figures"}
+    return places | {"commands": "Commands", "identity": "Identity"}
+
+
+def _missing(sentences: Sequence[str]) -> str:
+    items = "".join(f"<li>{html.escape(sentence)}</li>" for sentence in sentences)
+    return f"<ul class=note>{items}</ul>" if items else ""
+
+
+def _rankings(methods: Methods, results: Sequence[Evaluation]) -> str:
+    parts = []
+    for task, group in methods.items():
+        links = [_method_links(method, results) for method in ranking(group)]
+        short = html.escape(task.removeprefix("rl2grid/"))
+        parts.append(f"<h3>{short}</h3>{result_table_html(ranking_table(group), links=links)}")
+    return "".join(parts)
+
+
+def _method_links(method: Method, results: Sequence[Evaluation]) -> str:
+    ids = {id(result) for result in method.evaluations}
+    return " ".join(_link(f"e{k}") for k, result in enumerate(results, start=1) if id(result) in ids)
+
+
+def _tables(section: Section) -> list[str]:
+    parts = []
+    for table in section.tables:
+        heading = html.escape(table.name.replace("-", " ").capitalize())
+        parts.append(f"<section><h3>{heading}</h3>{result_table_html(table, made=_made_by(''))}</section>")
+    return ["<h2 id=tables>Tables</h2>", *parts] if parts else []
+
+
+def _commands(collection: Collection, command: str, train_commands: Mapping[Path, str]) -> str:
+    parts = [commands_html([("this page", command)])]
+    tasks = dict.fromkeys(
+        [*(result.episodes[0].task for result in collection.evaluations), *(run.task for run in collection.runs)]
+    )
+    for task in tasks:
+        runs = [(f"r{k}", run) for k, run in enumerate(collection.runs, start=1) if run.task == task]
+        results = [
+            (f"e{k}", one) for k, one in enumerate(collection.evaluations, start=1) if one.episodes[0].task == task
+        ]
+        made = [(_named(place, _run_name(run)), train_commands[run.folder]) for place, run in runs]
+        made += [(_named(place, _name(result)), result.command) for place, result in results]
+        parts.append(
+            f"<h3 id='{_task_id(task)}'>{html.escape(task.removeprefix('rl2grid/'))}</h3>{commands_html(made)}"
         )
-    ]
-    if curves:
-        pictures.append(
-            _Picture(
-                "training",
-                "Survival of the episodes that ended in training, smoothed; diamonds: validation scenarios.",
-                commands.get("training", ""),
-                lambda theme: figures.training_curves(curves, theme=theme),
-            )
-        )
-    for number, recording in enumerate(recordings):
-        # Bound now: the loop's variable would be another one by the time it is drawn.
-        def draw(theme: Theme, recording: Recording = recording) -> Figure:
-            return figures.episode_loading(recording, theme=theme)
-
-        caption = (
-            "Loading of every line through one episode, the most loaded on top; orange and red are above the limit. "
-            "Below: where the agent was asked, and where it did something."
-        )
-        pictures.append(_Picture(f"episode-{number}-{recording.agent}", caption, commands.get("episodes", ""), draw))
-    return pictures
+    legend = (
+        "e: evaluations, r: training runs. Tables, figures and intervals are computed from their episodes and metrics "
+        "by the first command."
+    )
+    return f"<p class=note>{legend}</p>{''.join(parts)}"
 
 
-def _header(title: str, introduction: str, summaries: Sequence[Summary]) -> str:
-    best = max(summaries, key=lambda summary: summary.survival.value)
-    first = summaries[0]
-    facts = [
-        ("task", first.task.removeprefix("rl2grid/")),
-        ("best survival", f"{100 * best.survival.value:.1f}%"),
-        ("by", best.agent + ("" if best.heuristic == "none" else f" + {best.heuristic}")),
-        ("episodes per agent", str(first.episodes)),
-    ]
-    lead = f"<p>{html.escape(introduction)}</p>" if introduction else ""
-    return f"<header><h1>{html.escape(title)}</h1>{lead}{facts_html(facts)}</header>"
+def _made_by(task: str) -> str:
+    return f" Made by <a href='#{_task_id(task)}'>these commands</a>."
 
 
-def _table_html(summaries: Sequence[Summary]) -> str:
-    head = "".join(f"<th>{html.escape(heading)}</th>" for heading in summary_table.HEADINGS)
-    rows = []
-    for summary in summaries:
-        cells = "".join(f"<td>{cell_html(cell)}</td>" for cell in summary_table.table_cells(summary))
-        rows.append(f"<tr{' class=best' if summary_table.is_best(summary, summaries) else ''}>{cells}</tr>")
-    return scrolling(head, "".join(rows))
+def _named(place: str, name: str) -> str:
+    return f"<span id={place}>{place}: {html.escape(name)}</span>"
 
 
-def _endings_html(summaries: Sequence[Summary]) -> str:
-    reasons = sorted({reason for summary in summaries for reason in summary.game_over})
-    if not reasons:
-        return ""
-    headings = ("agent", "heuristic", "completed", *(reason.replace("_", " ").lower() for reason in reasons))
-    rows = [
-        (
-            summary.agent,
-            summary.heuristic,
-            str(summary.episodes - sum(summary.game_over.values())),
-            *(str(summary.game_over.get(reason, 0)) for reason in reasons),
-        )
-        for summary in summaries
-    ]
-    return f"<section><h2>How episodes ended</h2>{table_html(headings, rows)}</section>"
+def _name(result: Evaluation) -> str:
+    first = result.episodes[0]
+    folder = f", {result.folder}" if result.folder else ""
+    return f"{method_label(first)} on {first.task.removeprefix('rl2grid/')}, {len(result.episodes)} episodes{folder}"
 
 
-def _commands_html(results: Sequence[Evaluation], commands: Mapping[str, str]) -> str:
-    made = [(f"results of {html.escape(result.summary.agent)}", result.command) for result in results]
-    made += [(html.escape(purpose), command) for purpose, command in commands.items()]
-    return f"<section><h2>What made every number</h2>{commands_html(made)}</section>"
+def _run_name(run: TrainingRun) -> str:
+    return f"{run.curve.label}, seed {run.seed}, {run.folder}"
+
+
+def _places(letter: str, items: Sequence[object]) -> list[str]:
+    return [f"{letter}{number}" for number in range(1, len(items) + 1)]
+
+
+def _link(place: str) -> str:
+    return f"<a href='#{place}'>{place}</a>"
+
+
+def _task_id(task: str) -> str:
+    return f"commands-{html.escape(task.removeprefix('rl2grid/'))}" if task else "commands"
+
+
+_STYLE = """
+body { max-width: 72rem; }
+nav { display: flex; flex-wrap: wrap; gap: .4rem 1.2rem; margin-top: 1.25rem; }
+h3 { font-size: 1rem; margin: 1.75rem 0 .5rem; }
+section > figure { max-width: 60rem; }
+td.links { max-width: 12rem; min-width: 4rem; white-space: normal; }
+@media (max-width: 40rem) { td:first-child { min-width: 5.5rem; white-space: normal; } }
+"""

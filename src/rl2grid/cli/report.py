@@ -39,7 +39,8 @@ def add_parser(commands: Any) -> None:
 def _run(options: argparse.Namespace) -> int:
     collection = collect(options.folders, options.split)
     try:
-        from rl2grid.analysis import results_page, section
+        from rl2grid.analysis import section
+        from rl2grid.analysis.report import write_report
     except ImportError as error:
         raise UsageError(f"Reports need {error.name}: install it with `pip install rl2grid[analysis]`.") from None
     plan = section.plan_section(collection.evaluations, collection.runs)
@@ -49,7 +50,7 @@ def _run(options: argparse.Namespace) -> int:
     path = options.output / PAGE_FILE
     with Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), transient=True) as bar:
         task = bar.add_task("Drawing", total=number)
-        size = results_page.write_results_page(
+        size = write_report(
             path,
             collection,
             title=options.title or _title(collection),

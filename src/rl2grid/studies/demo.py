@@ -13,7 +13,7 @@ from pathlib import Path
 import gymnasium
 from rich.console import Console
 
-from rl2grid.analysis.report import write_report
+from rl2grid.analysis.demo_report import write_demo_report
 from rl2grid.analysis.summary_table import rich_table
 from rl2grid.envs.registration import register_all
 from rl2grid.errors import UsageError
@@ -66,7 +66,7 @@ def run_demo(output: Path, decisions: int | None = None) -> Path:
     recording = _record(run)
 
     console.rule("4/4 Writing the report", align="left")
-    report = write_report(
+    report = write_demo_report(
         output,
         results,
         title="PPO on bus14",
