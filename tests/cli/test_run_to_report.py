@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from rl2grid.cli.main import main
-from rl2grid.ledger.leaderboard import find_evaluation, make_entry, verify_entry
+from rl2grid.ledger.making import find_evaluation, make_entry
+from rl2grid.ledger.verification import verify_entry
 from rl2grid.records.evaluations import load_evaluation
 from rl2grid.records.trainings import RUN_FILE, read_training_run
 from rl2grid.training.commands import training_command

@@ -28,9 +28,10 @@ from rl2grid.errors import UsageError
 from rl2grid.evaluation import protocol as evaluation
 from rl2grid.evaluation.crew import Job, Setting, make_crew
 from rl2grid.evaluation.episode import environment_seed, play_episode
-from rl2grid.evaluation.protocol import PARTIAL_FILE, evaluate, run_evaluation
+from rl2grid.evaluation.protocol import evaluate, run_evaluation
 from rl2grid.grids import GRID_IDS
 from rl2grid.records.episodes import EPISODES_FILE, Episode, read_episodes
+from rl2grid.records.evaluation_folder import PARTIAL_FILE
 from rl2grid.records.evaluations import EVALUATION_FILE, Evaluation, load_evaluation
 from rl2grid.scenarios.generated import VERSION
 from rl2grid.scenarios.library import list_scenarios

@@ -16,7 +16,8 @@ import pytest
 
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.protocol import evaluate
-from rl2grid.ledger.leaderboard import check_entry, find_evaluation, make_entry, verify_entry
+from rl2grid.ledger.making import find_evaluation, make_entry
+from rl2grid.ledger.verification import check_entry, verify_entry
 from rl2grid.records.entries import episode_hash, read_entry, write_entry
 from rl2grid.records.episodes import FACTS
 from rl2grid.records.evaluations import identity_hash

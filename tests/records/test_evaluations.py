@@ -13,8 +13,9 @@ from rl2grid.analysis.summary_table import HEADINGS, markdown_table, rich_table
 from rl2grid.errors import UsageError
 from rl2grid.records.episodes import COLUMN_NAMES, read_episodes, write_episodes
 from rl2grid.records.evaluations import check_comparable, load_evaluation
+from rl2grid.records.metrics import read_validations
 from rl2grid.records.summary import by_scenario, summarise
-from rl2grid.records.trainings import read_training_curve, read_validations
+from rl2grid.records.trainings import read_training_curve
 
 
 def test_episodes_survive_a_file_digit_by_digit(tmp_path):

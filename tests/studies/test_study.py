@@ -22,12 +22,15 @@ from rl2grid.envs.tasks import find_task
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import AGENTS, make_agent
 from rl2grid.records.files import write_json
+from rl2grid.records.metrics import MetricsTail
 from rl2grid.studies import cell as study_cell
 from rl2grid.studies import run as study_run
 from rl2grid.studies.backends import Local, Slurm
 from rl2grid.studies.cell import BUSY, FAILED, FINISHED, REFUSED, CellResult, prepare
-from rl2grid.studies.run import MetricsTail, State, read_states, run_study
-from rl2grid.studies.study import cell_from_dict, cell_to_dict, included_studies, parse_study
+from rl2grid.studies.cells import cell_from_dict, cell_to_dict
+from rl2grid.studies.run import run_study
+from rl2grid.studies.states import State, read_states
+from rl2grid.studies.study import included_studies, parse_study
 from rl2grid.studies.toml_file import read_toml
 
 GROUP: dict[str, Any] = {"algorithms": ["ppo"], "tasks": ["bus14-T0"]}
@@ -219,7 +222,7 @@ class FakeBackend:
 def quick(monkeypatch):
     monkeypatch.setattr(study_run, "_POLL_SECONDS", 0.001)
     monkeypatch.setattr(study_run, "_BUSY_SECONDS", 0.001)
-    monkeypatch.setattr(study_run, "_write_episodes", lambda path, states: None)
+    monkeypatch.setattr(study_run, "write_study_episodes", lambda folder, cells: None)
 
 
 def test_failures_are_tried_again_refusals_are_not_and_the_others_go_on(tmp_path: Path, quick):

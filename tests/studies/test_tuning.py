@@ -16,20 +16,19 @@ import pytest
 import rl2grid
 from rl2grid.algorithms.registry import algorithm_names, find_algorithm
 from rl2grid.errors import UsageError
-from rl2grid.studies import tuning as tuning_module
-from rl2grid.studies.tuning import (
+from rl2grid.studies import search as search_module
+from rl2grid.studies.search import (
     Reports,
-    Tuning,
     _begin,
     _open,
     _prepare,
     _put_back_interrupted,
     best_command,
     one_score,
-    parse_tuning,
     run_tuning,
     work,
 )
+from rl2grid.studies.tuning import Tuning, parse_tuning
 from rl2grid.training import runs
 
 SOURCES = str(Path(rl2grid.__file__).parents[1])
@@ -167,7 +166,7 @@ def test_of_equal_trials_one_is_trained_and_the_others_take_its_result(
 
     monkeypatch.setattr(runs, "train", train)
     monkeypatch.setattr(runs, "is_finished", lambda folder: (folder / "metrics.csv").exists())
-    monkeypatch.setattr(tuning_module, "validator", lambda args: lambda agent: {"survival": 0.5})
+    monkeypatch.setattr(search_module, "validator", lambda args: lambda agent: {"survival": 0.5})
     monkeypatch.setattr(optuna.trial.Trial, "should_prune", lambda self: prune)
     tuning = parse_tuning({**SEARCH, "trials": 3, "space": {"gamma": [0.9]}}, tmp_path)
     _prepare(tuning)
@@ -219,7 +218,8 @@ def test_a_poor_trial_is_ended_by_its_validation_survival(tmp_path: Path, monkey
 ONE_TRIAL_AND_A_CRASH = """
 import json, sys
 from pathlib import Path
-from rl2grid.studies.tuning import Tuning, _begin, _open
+from rl2grid.studies.search import _begin, _open
+from rl2grid.studies.tuning import Tuning
 folder = Path(sys.argv[1])
 tuning = Tuning(**json.loads((folder / "tuning.json").read_text()), output=folder)
 study = _open(tuning)

@@ -1,21 +1,12 @@
-"""The metrics of a run, in a tidy CSV file and in TensorBoard.
-
-``metrics.csv`` has one row per value::
-
-    step,grid_steps,wall_time,name,value
-
-which ``pandas.read_csv(path).pivot(index="step", columns="name", values="value")`` turns into one column per metric.
-"""
+"""The metrics of a run, in ``metrics.csv`` (see :mod:`rl2grid.records.metrics`) and in TensorBoard."""
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-COLUMNS = ("step", "grid_steps", "wall_time", "name", "value")
-"""``step``: decisions of the agent; ``grid_steps``: grid steps behind them; ``wall_time``: seconds of training."""
+from rl2grid.records.metrics import MetricsFile
 
 
 class MetricsWriter:
@@ -29,10 +20,7 @@ class MetricsWriter:
             after_step: Rows of later steps are dropped first: a resumed run writes them again.
             tensorboard: Whether to write TensorBoard events as well.
         """
-        path = folder / "metrics.csv"
-        _keep_rows_until(path, after_step)
-        self._file = path.open("a", encoding="utf-8", newline="")
-        self._csv = csv.writer(self._file, lineterminator="\n")
+        self._file = MetricsFile(folder, after_step=after_step)
         self._events: Any = None
         if tensorboard:
             # Imported here: TensorBoard takes a second, and not every run wants it.
@@ -42,16 +30,10 @@ class MetricsWriter:
 
     def write(self, step: int, grid_steps: int, wall_time: float, values: Mapping[str, float]) -> None:
         """Append the values of one step, complete on disk when this returns."""
-        for name, value in values.items():
-            self._csv.writerow((step, grid_steps, f"{wall_time:.3f}", name, repr(float(value))))
-            if self._events is not None:
-                self._events.add_scalar(name, value, step)
-        self.flush()
-
-    def flush(self) -> None:
-        """Hand everything to the operating system."""
-        self._file.flush()
+        self._file.write(step, grid_steps, wall_time, values)
         if self._events is not None:
+            for name, value in values.items():
+                self._events.add_scalar(name, value, step)
             self._events.flush()
 
     def close(self) -> None:
@@ -59,18 +41,3 @@ class MetricsWriter:
         self._file.close()
         if self._events is not None:
             self._events.close()
-
-
-def _keep_rows_until(path: Path, step: int) -> None:
-    """Cut the file behind its last complete row of a step up to ``step``; make it, with its header, if need be."""
-    header = ",".join(COLUMNS) + "\n"
-    if not path.exists() or path.stat().st_size < len(header):
-        path.write_text(header, encoding="utf-8", newline="\n")
-        return
-    with open(path, "rb+") as file:
-        end = len(file.readline())
-        for row in file:
-            if not row.endswith(b"\n") or int(row.split(b",", 1)[0]) > step:
-                break
-            end += len(row)
-        file.truncate(end)

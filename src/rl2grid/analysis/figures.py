@@ -37,9 +37,10 @@ from rl2grid.drawing.theme import (
     style,
 )
 from rl2grid.records.evaluations import Evaluation
+from rl2grid.records.metrics import SURVIVAL
 from rl2grid.records.recordings import Recording
 from rl2grid.records.statistics import bootstrap_band, episode_mean
-from rl2grid.records.trainings import SURVIVAL, Metric, TrainingCurve
+from rl2grid.records.trainings import Metric, TrainingCurve
 
 STEPS_PER_DAY = 288
 MAX_COLUMNS = 360

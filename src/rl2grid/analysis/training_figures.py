@@ -12,7 +12,8 @@ from matplotlib.ticker import FuncFormatter, PercentFormatter
 from rl2grid.analysis import figures
 from rl2grid.drawing.theme import LIGHT, VERMILLION, Theme, style
 from rl2grid.mdp.constraints import THRESHOLDS
-from rl2grid.records.trainings import SURVIVAL, TrainingCurve
+from rl2grid.records.metrics import SURVIVAL
+from rl2grid.records.trainings import TrainingCurve
 
 
 class Panel(NamedTuple):

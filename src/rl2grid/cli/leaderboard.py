@@ -16,12 +16,14 @@ from rl2grid.analysis.table import result_table_rich
 from rl2grid.errors import UsageError
 from rl2grid.records.entries import Entry, read_entry, write_entry
 from rl2grid.records.evaluations import check_comparable
+from rl2grid.records.ledger import enter, read_ledger
 from rl2grid.records.methods import Method
 from rl2grid.scenarios.splits import SPLITS
 
 if TYPE_CHECKING:
     from rl2grid.records.evaluations import Evaluation
 
+_SUBJECT = "a run folder, or an agent without training as greedy@bus14-T0 or random@bus14-T0:idle"
 DIFFERENT = 1
 """Exit status when an entry is not what its actions make."""
 
@@ -32,6 +34,7 @@ def add_parser(commands: Any) -> None:
     parser.set_defaults(run=lambda options: _print_help(parser))
     actions = parser.add_subparsers(dest="action", metavar="action")
     _add_entry(actions)
+    _add_test(actions)
     _add_verify(actions)
     _add_table(actions)
 
@@ -51,20 +54,29 @@ def _add_entry(actions: Any) -> None:
     parser.set_defaults(run=_entry)
 
 
+def _add_test(actions: Any) -> None:
+    parser = actions.add_parser("test", help="play the test months once, and enter the result in a ledger")
+    parser.add_argument("subjects", nargs="*", metavar="subject", help=_SUBJECT)
+    parser.add_argument("--ledger", type=Path, required=True, help="the file")
+    parser.set_defaults(run=_test)
+
+
 def _add_verify(actions: Any) -> None:
-    parser = actions.add_parser("verify", help="play the actions of entries again and compare")
-    parser.add_argument("files", nargs="+", type=Path, metavar="file", help="entries")
+    parser = actions.add_parser("verify", help="play the actions of entries, or tests of a ledger, again and compare")
+    parser.add_argument("files", nargs="*", metavar="file", help=f"entries; with --ledger: each {_SUBJECT}")
+    parser.add_argument("--ledger", type=Path, default=None, help="compare with the test results of this file")
     parser.set_defaults(run=_verify)
 
 
 def _add_table(actions: Any) -> None:
     parser = actions.add_parser("table", help="rank entries by survival, as they are stored")
-    parser.add_argument("files", nargs="+", type=Path, metavar="file", help="entries")
+    parser.add_argument("files", nargs="*", type=Path, metavar="file", help="entries")
+    parser.add_argument("--ledger", type=Path, default=None, help="print the test results of this file instead")
     parser.set_defaults(run=_table)
 
 
 def _entry(options: argparse.Namespace) -> int:
-    from rl2grid.ledger.leaderboard import find_evaluation, make_entry
+    from rl2grid.ledger.making import find_evaluation, make_entry
     from rl2grid.records.evaluations import load_evaluation
 
     folder = find_evaluation(options.folder, options.split)
@@ -81,10 +93,43 @@ def _entry(options: argparse.Namespace) -> int:
     return 0
 
 
-def _verify(options: argparse.Namespace) -> int:
-    from rl2grid.ledger.leaderboard import check_entry, verify_entry
+def _test(options: argparse.Namespace) -> int:
+    from rl2grid.ledger.subjects import find_subject, play_test
 
-    entries = _read(options.files)
+    for subject in [find_subject(text) for text in options.subjects]:
+        if subject.digest in read_ledger(options.ledger):
+            print(f"{subject.agent} on {subject.task} has had its test: see {options.ledger.name}.")
+            continue
+        enter(options.ledger, play_test(subject))
+    return 0
+
+
+def _verify(options: argparse.Namespace) -> int:
+    if options.ledger is not None:
+        return _verify_tests(options.ledger, options.files)
+    return _verify_entries([Path(file) for file in _some(options.files)])
+
+
+def _verify_tests(ledger: Path, texts: Sequence[str]) -> int:
+    from rl2grid.ledger.subjects import find_subject
+    from rl2grid.ledger.verification import verify_test
+
+    different = 0
+    for subject in [find_subject(text) for text in texts]:
+        stored = read_ledger(ledger).get(subject.digest)
+        if stored is None:
+            raise UsageError(f"The ledger has no test of {str(subject.agent)!r} on {subject.task} to compare with.")
+        difference = verify_test(stored, subject)
+        different += difference is not None
+        words = f"differs in {difference}" if difference else "the same, bit for bit"
+        print(f"{subject}: {words}.", flush=True)
+    return DIFFERENT if different else 0
+
+
+def _verify_entries(paths: Sequence[Path]) -> int:
+    from rl2grid.ledger.verification import check_entry, verify_entry
+
+    entries = _read(paths)
     for path, entry in entries.items():
         check_entry(entry, str(path))
     different = 0
@@ -103,10 +148,15 @@ def _verify(options: argparse.Namespace) -> int:
 
 
 def _table(options: argparse.Namespace) -> int:
+    if options.ledger is not None:
+        from rl2grid.analysis.ledger_table import ledger_table
+
+        print(ledger_table(read_ledger(options.ledger).values()))
+        return 0
     from rl2grid.analysis.result_tables import entry_table
 
     by_task: dict[str, dict[Path, Evaluation]] = {}
-    for path, entry in _read(options.files).items():
+    for path, entry in _read(_some(options.files)).items():
         by_task.setdefault(entry.identity["task"], {})[path] = entry.evaluation
     for results in by_task.values():
         check_comparable(list(results.values()))
@@ -118,6 +168,12 @@ def _table(options: argparse.Namespace) -> int:
         wide.print(result_table_rich(entry_table(methods), title=task.removeprefix("rl2grid/")))
     print("As stored: 'rl2grid leaderboard verify' plays the actions again.")
     return 0
+
+
+def _some(files: Sequence[Any]) -> Sequence[Any]:
+    if not files:
+        raise UsageError("No entry was given: name files that 'rl2grid leaderboard entry' wrote, or a --ledger.")
+    return files
 
 
 def _read(paths: Sequence[Path]) -> dict[Path, Entry]:

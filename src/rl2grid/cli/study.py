@@ -13,7 +13,7 @@ from rl2grid.cli.train import INTERRUPTED
 from rl2grid.errors import UsageError
 
 if TYPE_CHECKING:
-    from rl2grid.studies.study import Study
+    from rl2grid.studies.cells import Study
 
 FAILED = 1
 """Exit status when cells were given up."""
@@ -71,7 +71,9 @@ def _add_tune(actions: Any) -> None:
 def _run(options: argparse.Namespace) -> int:
     study = _load(options)
     from rl2grid.studies.backends import make_backend
-    from rl2grid.studies.run import State, results_table, run_study, study_table
+    from rl2grid.studies.progress import results_table, study_table
+    from rl2grid.studies.run import run_study
+    from rl2grid.studies.states import State
 
     console = Console()
     backend = make_backend(options.backend, study.output / "jobs", options.jobs, study.slurm)
@@ -92,7 +94,8 @@ def _run(options: argparse.Namespace) -> int:
 
 def _status(options: argparse.Namespace) -> int:
     study = _load(options)
-    from rl2grid.studies.run import read_states, results_table, study_table
+    from rl2grid.studies.progress import results_table, study_table
+    from rl2grid.studies.states import read_states
 
     console, states = Console(), read_states(study)
     console.print(study_table(study, states, None))
@@ -120,7 +123,8 @@ def _list(options: argparse.Namespace) -> int:
 
 def _tune(options: argparse.Namespace) -> int:
     _check_installed()
-    from rl2grid.studies.tuning import best_command, load_tuning, run_tuning
+    from rl2grid.studies.search import best_command, run_tuning
+    from rl2grid.studies.tuning import load_tuning
 
     tuning = load_tuning(options.file, options.output)
     best = run_tuning(tuning, options.jobs, Console())

@@ -4,45 +4,32 @@ Nothing is sampled: every scenario of the split is played from its beginning wit
 where maintenance, an opponent or the agent draw random numbers). Validation picks models; the test list is
 for the final word.
 
-An evaluation that is stored goes to a folder of its own::
-
-    evaluation.json          identity, request, command; the aggregates once it is complete
-    episodes.partial.csv     while it runs: the rows finished so far
-    episodes.csv             all rows, in the order of scenarios, then seeds
-
-A row is on disk when its episode ends. After a kill the same call goes on with the episodes that are
-missing. The result depends neither on the number of workers nor on interruptions.
+An evaluation that is stored goes to a folder of its own, see :mod:`rl2grid.records.evaluation_folder`. A row is on disk
+when its episode ends. After a kill the same call goes on with the episodes that are missing. The result depends neither
+on the number of workers nor on interruptions.
 """
 
 from __future__ import annotations
 
 import os
-import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
-
-import rich.progress
-from filelock import FileLock, Timeout
 
 from rl2grid.agents.agent import Agent
 from rl2grid.envs.options import TaskOptions
 from rl2grid.envs.tasks import Task, constraint_of, find_task
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import make_agent
-from rl2grid.evaluation.crew import Job, Progress, Setting, make_crew
+from rl2grid.evaluation.crew import Job, Setting, make_crew
+from rl2grid.evaluation.progress import show_progress
 from rl2grid.mdp.actions import action_set_hash
-from rl2grid.records.episodes import EPISODES_FILE, Episode, format_row, read_episodes, write_episodes
-from rl2grid.records.evaluations import EVALUATION_FILE, Evaluation, labels, read_request, write_evaluation
-from rl2grid.records.files import check_folder, make_folder
-from rl2grid.records.summary import Summary, summarise
+from rl2grid.records.episodes import Episode
+from rl2grid.records.evaluation_folder import open_store
+from rl2grid.records.evaluations import Evaluation, labels
 from rl2grid.records.versions import library_versions
 from rl2grid.scenarios.library import check_in_split, generator_version, list_scenarios, scenario_pack_hash
-
-PARTIAL_FILE = "episodes.partial.csv"
-LOCK_FILE = ".lock"
 
 AS_TRAINED = "as trained"
 """Value of ``heuristic``: the one that the policy was trained with; none for agents without training."""
@@ -140,7 +127,7 @@ def run_evaluation(
     """
     of_all = labels(identity)
     request = {"identity": dict(identity), "identity_hash": of_all["identity"], "jobs": [list(job) for job in jobs]}
-    with _store(output, request, command) as store, _display(setting, jobs, progress) as display:
+    with open_store(output, request, command) as store, show_progress(setting, jobs, progress) as display:
         done = {_job(episode): episode for episode in store.episodes}
         display.skip(done)
         missing = [job for job in jobs if job not in done]
@@ -249,188 +236,3 @@ def _call(
 
 def _job(episode: Episode) -> Job:
     return Job(episode.scenario, episode.seed, episode.start)
-
-
-class _Store:
-    """Where finished rows go; this one forgets them."""
-
-    episodes: tuple[Episode, ...] = ()
-    """Rows of an earlier, interrupted call."""
-
-    def add(self, episode: Episode) -> None:
-        """Keep a finished row."""
-
-    def finish(self, episodes: tuple[Episode, ...]) -> None:
-        """Keep the complete list."""
-
-    def close(self) -> None:
-        """Let others write."""
-
-
-class _FolderStore(_Store):
-    """Keeps rows in a folder, which is not made before the first of them."""
-
-    def __init__(self, folder: Path, request: Mapping[str, Any], command: str) -> None:
-        self._folder, self._request, self._command = folder, request, command
-        self._finished, self._partial = folder / EPISODES_FILE, folder / PARTIAL_FILE
-        self._lock: FileLock | None = None
-        if not folder.exists():
-            check_folder(folder)
-            return
-        if not folder.is_dir():
-            raise UsageError(f"{folder} is a file: give a folder to store the evaluation in.")
-        self._take_lock()
-        try:
-            self.episodes = self._stored_episodes()
-        except BaseException:
-            self.close()
-            raise
-
-    def add(self, episode: Episode) -> None:
-        if self._lock is None:
-            make_folder(self._folder)
-            self._take_lock()
-            self._check_still_unused()
-        if not self._partial.exists():
-            self._describe(None)
-            write_episodes(self._partial, self.episodes)
-        with self._partial.open("a", encoding="utf-8", newline="") as file:
-            file.write(format_row(episode))
-
-    def finish(self, episodes: tuple[Episode, ...]) -> None:
-        write_episodes(self._finished, episodes)
-        self._describe(summarise(episodes))
-        self._partial.unlink(missing_ok=True)
-
-    def close(self) -> None:
-        if self._lock is not None:
-            self._lock.release()
-
-    def _stored_episodes(self) -> tuple[Episode, ...]:
-        if not (self._folder / EVALUATION_FILE).exists():
-            return ()
-        _check_same_request(self._folder, self._request)
-        if self._finished.exists():
-            return read_episodes(self._finished)
-        if not self._partial.exists():
-            return ()
-        episodes = read_episodes(self._partial)
-        # Without the torn line that a kill may have left at the end.
-        write_episodes(self._partial, episodes)
-        return episodes
-
-    def _check_still_unused(self) -> None:
-        """Refuse what another process wrote since this evaluation began, when there was no folder."""
-        if not (self._folder / EVALUATION_FILE).exists():
-            return
-        _check_same_request(self._folder, self._request)
-        raise UsageError(
-            f"Another process wrote this evaluation to {self._folder} meanwhile: ask again to go on with what it wrote."
-        )
-
-    def _describe(self, summary: Summary | None) -> None:
-        write_evaluation(self._folder / EVALUATION_FILE, {**self._request, "command": self._command}, summary)
-
-    def _take_lock(self) -> None:
-        self._lock = FileLock(self._folder / LOCK_FILE)
-        try:
-            self._lock.acquire(timeout=0)
-        except Timeout:
-            raise UsageError(
-                f"Another process is writing to {self._folder}: wait for it, or choose another folder."
-            ) from None
-
-
-def _check_same_request(folder: Path, request: Mapping[str, Any]) -> None:
-    stored = read_request(folder / EVALUATION_FILE)
-    mine, theirs = request["identity"], stored["identity"]
-    differing = [key for key in {**theirs, **mine} if _plain(mine.get(key)) != theirs.get(key)]
-    if not differing and stored["jobs"] != request["jobs"]:
-        differing = ["scenarios or seeds"]
-    if differing:
-        raise UsageError(
-            f"{folder} holds another evaluation, with a different {differing[0]}: choose another folder, or remove it."
-        )
-
-
-def _plain(value: Any) -> Any:
-    """A value as JSON gives it back."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
-
-
-@contextmanager
-def _store(folder: Path | None, request: Mapping[str, Any], command: str) -> Iterator[_Store]:
-    store = _Store() if folder is None else _FolderStore(folder, request, command)
-    try:
-        yield store
-    finally:
-        store.close()
-
-
-class _Display:
-    """Tells of the course of an evaluation; this one keeps silent."""
-
-    def skip(self, jobs: Iterable[Job]) -> None:
-        """These were played in an earlier call."""
-
-    def advance(self, progress: Progress) -> None:
-        """An episode is under way."""
-
-    def finish(self, episode: Episode) -> None:
-        """An episode ended."""
-
-
-class _ProgressBar(_Display):
-    """Episodes done, grid steps per second, remaining time."""
-
-    def __init__(self, bar: rich.progress.Progress, setting: Setting, n_jobs: int) -> None:
-        self._bar = bar
-        self._began = time.monotonic()
-        self._shares: dict[Job, float] = {}
-        self._steps: dict[Job, int] = {}
-        self._finished = 0
-        self._n_jobs = n_jobs
-        self._id = bar.add_task(f"Evaluating {setting.agent.name}", total=n_jobs, rate="", count=f"0/{n_jobs}")
-
-    def skip(self, jobs: Iterable[Job]) -> None:
-        self._shares |= dict.fromkeys(jobs, 1.0)
-        self._finished = len(self._shares)
-        self._show()
-
-    def advance(self, progress: Progress) -> None:
-        self._shares[progress.job] = progress.grid_steps / progress.episode_length
-        self._steps[progress.job] = progress.grid_steps
-        self._show()
-
-    def finish(self, episode: Episode) -> None:
-        job = _job(episode)
-        self._shares[job], self._steps[job] = 1.0, episode.grid_steps
-        self._finished += 1
-        self._show()
-
-    def _show(self) -> None:
-        rate = sum(self._steps.values()) / max(time.monotonic() - self._began, 1e-3)
-        self._bar.update(
-            self._id,
-            completed=sum(self._shares.values()),
-            rate=f"{rate:,.0f} grid steps/s",
-            count=f"{self._finished}/{self._n_jobs} episodes",
-        )
-
-
-@contextmanager
-def _display(setting: Setting, jobs: Sequence[Job], progress: bool) -> Iterator[_Display]:
-    if not progress:
-        yield _Display()
-        return
-    columns = (
-        rich.progress.TextColumn("{task.description}"),
-        rich.progress.BarColumn(),
-        rich.progress.TextColumn("{task.fields[count]}"),
-        rich.progress.TextColumn("{task.fields[rate]}"),
-        rich.progress.TimeRemainingColumn(),
-    )
-    with rich.progress.Progress(*columns) as bar:
-        yield _ProgressBar(bar, setting, len(jobs))

@@ -10,20 +10,25 @@ A folder is one of
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from rl2grid.errors import UsageError
-from rl2grid.records.evaluations import EVALUATION_FILE, Evaluation, load_evaluation
-from rl2grid.records.trainings import RUN_FILE, TrainingRun, read_training_run
+from rl2grid.records.evaluations import Evaluation, is_evaluation, load_evaluation
+from rl2grid.records.studies import (
+    CELL_FILE,
+    CELLS_FOLDER,
+    EVALUATION_FOLDER,
+    RUN_FOLDER,
+    STUDY_FILE,
+    is_cell_finished,
+    read_cell,
+    read_json,
+)
+from rl2grid.records.trainings import TrainingRun, is_run, read_training_run
 from rl2grid.scenarios.splits import VALIDATION
-
-STUDY_FILE, CELLS_FOLDER = "study.json", "cells"
-CELL_FILE, RESULT_FILE = "cell.json", "result.json"
-RUN_FOLDER, EVALUATION_FOLDER = "run", "evaluation"
 
 
 @dataclass
@@ -56,8 +61,8 @@ def collect(folders: Sequence[str], split: str | None = None) -> Collection:
             raise UsageError(f"A study has names of its own: give {folder} without {label}=.")
         if study is not None:
             _add_study(collection, study, split)
-        elif (folder / CELL_FILE).is_file():
-            _add_cell(collection, folder, label)
+        elif (cell := read_cell(folder)) is not None:
+            _add_cell(collection, folder, cell, label)
         else:
             _add_folder(collection, folder, label, split or VALIDATION)
     return collection
@@ -79,16 +84,16 @@ def parse_folder(words: str) -> tuple[str | None, Path]:
 
 def find_evaluations(folder: Path, split: str) -> list[Path]:
     """The folder itself, or those below it of the split, which 'rl2grid evaluate' names after what else was asked."""
-    if (folder / EVALUATION_FILE).is_file():
+    if is_evaluation(folder):
         return [folder]
     below = (folder / EVALUATION_FOLDER).glob(f"{split}*")
-    return sorted(path for path in below if (path / EVALUATION_FILE).is_file())
+    return sorted(path for path in below if is_evaluation(path))
 
 
 def _add_folder(collection: Collection, folder: Path, label: str | None, split: str) -> None:
     evaluations = find_evaluations(folder, split)
     collection.evaluations += [_named(load_evaluation(evaluation), label) for evaluation in evaluations]
-    if (folder / RUN_FILE).is_file():
+    if is_run(folder):
         run = read_training_run(folder, label)
         collection.runs.append(run)
         if not evaluations:
@@ -114,27 +119,27 @@ def _study_folder(folder: Path) -> Path | None:
 
 def _add_study(collection: Collection, folder: Path, split: str | None) -> None:
     taken = 0
-    for entry in _read_json(folder / STUDY_FILE)["cells"]:
-        cell = folder / CELLS_FOLDER / entry["cell"]
-        if not (cell / RESULT_FILE).is_file():
-            collection.missing.append(f"Cell {cell.name} of the study {folder} is not finished.")
+    for entry in read_json(folder / STUDY_FILE)["cells"]:
+        place = folder / CELLS_FOLDER / entry["cell"]
+        if not is_cell_finished(place):
+            collection.missing.append(f"Cell {place.name} of the study {folder} is not finished.")
             continue
-        played = _read_json(cell / CELL_FILE)["split"]
+        cell = read_json(place / CELL_FILE)
+        played = cell["split"]
         if split not in (None, played):
             collection.missing.append(
-                f"Cell {cell.name} of the study {folder} was evaluated on {played}, not on {split}."
+                f"Cell {place.name} of the study {folder} was evaluated on {played}, not on {split}."
             )
             continue
-        _add_cell(collection, cell, None)
+        _add_cell(collection, place, cell, None)
         taken += 1
     if not taken:
         wanted = "finished cell" if split is None else f"finished cell that was evaluated on {split}"
         raise UsageError(f"The study {folder} has no {wanted} yet: 'rl2grid study status' says how far it is.")
 
 
-def _add_cell(collection: Collection, folder: Path, given: str | None) -> None:
+def _add_cell(collection: Collection, folder: Path, cell: Mapping[str, Any], given: str | None) -> None:
     """One cell of a study: under the label given, else under that of its group."""
-    cell = _read_json(folder / CELL_FILE)
     label = given or _cell_label(cell)
     collection.evaluations.append(_named(load_evaluation(folder / EVALUATION_FOLDER), label))
     if cell["training"] is not None:
@@ -155,10 +160,3 @@ def _named(result: Evaluation, label: str | None) -> Evaluation:
     if label is None:
         return result
     return replace(result, episodes=tuple(replace(episode, agent=label) for episode in result.episodes))
-
-
-def _read_json(path: Path) -> Any:
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise UsageError(f"{path} cannot be read as part of a study: {error}.") from None

@@ -79,13 +79,18 @@ def read_request(path: Path) -> dict[str, Any]:
         raise UsageError(f"{path} is no description of an evaluation: {error!r}.") from None
 
 
+def is_evaluation(folder: Path) -> bool:
+    """Whether a folder holds an evaluation, finished or not."""
+    return (folder / EVALUATION_FILE).is_file()
+
+
 def load_evaluation(folder: Path) -> Evaluation:
     """A finished evaluation.
 
     Raises:
         UsageError: the folder holds none, or one that was interrupted.
     """
-    if not (folder / EVALUATION_FILE).is_file():
+    if not is_evaluation(folder):
         raise UsageError(f"{folder} holds no evaluation: give a folder that 'rl2grid evaluate' wrote.")
     request = read_request(folder / EVALUATION_FILE)
     if not (folder / EPISODES_FILE).is_file():

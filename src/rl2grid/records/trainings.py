@@ -1,11 +1,11 @@
-"""What training runs say of themselves: their ``metrics.csv``, and of what task and method they are."""
+"""What training runs say of themselves: ``config.json``, ``energy.json``, and curves of their ``metrics.csv``."""
 
 from __future__ import annotations
 
-import csv
-import io
 import json
-from collections.abc import Iterator, Mapping, Sequence
+import os
+import shutil
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,11 +14,10 @@ import numpy as np
 
 from rl2grid.arrays import F64
 from rl2grid.errors import UsageError
+from rl2grid.records.files import make_folder, write_json
+from rl2grid.records.metrics import EPISODES, METRICS_FILE, SURVIVAL, VALIDATION, read_rows
 
-SURVIVAL, VALIDATION = "charts/survival", "validation/survival"
-"""Names of the metrics: mean over the episodes that ended in an iteration, and on the validation scenarios."""
-EPISODES = "charts/episodes"
-RUN_FILE, METRICS_FILE = "config.json", "metrics.csv"
+RUN_FILE, ENERGY_FILE, TRACKING_FILE = "config.json", "energy.json", "wandb.json"
 _COLUMNS = ("step", "grid_steps", "name", "value")
 
 
@@ -66,6 +65,65 @@ class TrainingRun:
     curve: TrainingCurve
 
 
+def is_run(folder: Path) -> bool:
+    """Whether a folder is that of a training run."""
+    return (folder / RUN_FILE).is_file()
+
+
+def create_run_folder(folder: Path, configuration: Mapping[str, Any]) -> None:
+    """Make the folder of a run with its configuration: it appears complete or not at all.
+
+    Raises:
+        UsageError: it cannot be made.
+    """
+    make_folder(folder.parent)
+    temporary = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
+    try:
+        temporary.mkdir()
+        write_json(temporary / RUN_FILE, configuration)
+        os.rename(temporary, folder)
+    except OSError as error:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise UsageError(f"Folder {str(folder)!r} cannot be made: {error.strerror}.") from error
+
+
+def read_configuration(folder: Path) -> dict[str, Any]:
+    """What :func:`create_run_folder` was given: ``request``, ``identity`` and ``seeds``.
+
+    Raises:
+        OSError: there is no such file.
+        ValueError: it is no JSON.
+    """
+    configuration: dict[str, Any] = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
+    return configuration
+
+
+def read_energy(folder: Path) -> dict[str, Any] | None:
+    """The energy account of a run; None where there is none."""
+    path = folder / ENERGY_FILE
+    if not path.is_file():
+        return None
+    account: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return account
+
+
+def write_energy(folder: Path, account: Mapping[str, Any]) -> None:
+    """Write the energy account of a run."""
+    write_json(folder / ENERGY_FILE, account)
+
+
+def read_tracking(folder: Path) -> str | None:
+    """The id under which a run is tracked; None where it is not."""
+    path = folder / TRACKING_FILE
+    return str(json.loads(path.read_text(encoding="utf-8"))["id"]) if path.exists() else None
+
+
+def write_tracking(folder: Path, run_id: str) -> str:
+    """Write the id under which a run is tracked, and return it."""
+    write_json(folder / TRACKING_FILE, {"id": run_id}, indent=None)
+    return run_id
+
+
 def read_training_curve(path: Path, label: str) -> TrainingCurve:
     """The curve of a run.
 
@@ -80,7 +138,7 @@ def read_training_curve(path: Path, label: str) -> TrainingCurve:
     """
     path = path / METRICS_FILE if path.is_dir() else path
     try:
-        rows = [[row[column] for column in _COLUMNS] for row in _read_rows(path)]
+        rows = [[row[column] for column in _COLUMNS] for row in read_rows(path)]
         points = [(name, float(step), float(grid_steps), float(value)) for step, grid_steps, name, value in rows]
     except (OSError, KeyError, TypeError, ValueError):
         raise UsageError(
@@ -102,10 +160,10 @@ def read_training_run(folder: Path, label: str | None = None) -> TrainingRun:
     Raises:
         UsageError: the folder is no run, or one of its files is missing or not what it should be.
     """
-    if not (folder / RUN_FILE).is_file():
+    if not is_run(folder):
         raise UsageError(f"{folder} holds no run: give a folder that 'rl2grid train' wrote.")
     try:
-        config = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
+        config = read_configuration(folder)
         request, identity = config["request"], config["identity"]
         hyperparameters = dict(request["hyperparameters"])
         seed = int(hyperparameters.pop("seed"))
@@ -121,22 +179,6 @@ def read_training_run(folder: Path, label: str | None = None) -> TrainingRun:
     heuristic = keywords.get("heuristic")
     name = label or (f"{algorithm} + {heuristic}" if heuristic else algorithm)
     return TrainingRun(folder, task, settings, seed, read_training_curve(folder, name))
-
-
-def read_validations(folder: Path) -> dict[int, dict[str, float]]:
-    """What a run reached on the validation scenarios: means over episodes by decisions, then name.
-
-    Args:
-        folder: the run folder; without metrics there were no validations.
-    """
-    path, prefix = folder / METRICS_FILE, "validation/"
-    if not path.exists():
-        return {}
-    validations: dict[int, dict[str, float]] = {}
-    for row in _read_rows(path):
-        if row["name"].startswith(prefix):
-            validations.setdefault(int(row["step"]), {})[row["name"].removeprefix(prefix)] = float(row["value"])
-    return validations
 
 
 def group_curves(runs: Sequence[TrainingRun]) -> dict[str, dict[str, tuple[TrainingCurve, ...]]]:
@@ -169,12 +211,6 @@ def _check_one_method(label: str, runs: Sequence[TrainingRun]) -> None:
                 )
         if run.seed in {earlier.seed for earlier in runs[:place]}:
             raise UsageError(f"Two runs of {label} on {run.task} have seed {run.seed}: leave out {run.folder}.")
-
-
-def _read_rows(path: Path) -> Iterator[dict[str, str]]:
-    """The rows of a metrics file. A last line without its end, as a killed writer leaves it, is ignored."""
-    text = path.read_text(encoding="utf-8")
-    return csv.DictReader(io.StringIO(text[: text.rfind("\n") + 1]))
 
 
 def _metrics(points: list[tuple[str, float, float, float]]) -> dict[str, Metric]:

@@ -22,20 +22,26 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from filelock import FileLock, Timeout
 
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.flags import evaluate_command
 from rl2grid.evaluation.protocol import evaluate
-from rl2grid.records.collection import CELL_FILE, EVALUATION_FOLDER, RESULT_FILE, RUN_FOLDER
-from rl2grid.records.episodes import EPISODES_FILE
-from rl2grid.records.files import write_json
-from rl2grid.records.trainings import METRICS_FILE
-from rl2grid.studies.study import Cell, Training, cell_from_dict, cell_to_dict
+from rl2grid.records.metrics import trained_seconds
+from rl2grid.records.studies import (
+    CELL_FILE,
+    EVALUATION_FOLDER,
+    RUN_FOLDER,
+    CellResult,
+    read_cell,
+    read_json,
+    read_result,
+    write_cell,
+    write_result,
+)
+from rl2grid.studies.cells import Cell, Training, cell_from_dict, cell_to_dict
 from rl2grid.training import runs
 from rl2grid.training.commands import train_command
 from rl2grid.training.validation import validator
@@ -49,19 +55,6 @@ COMMAND: tuple[str, ...] = (sys.executable, "-m", "rl2grid.studies.cell")
 _SINGLE_THREADED = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
-@dataclass(frozen=True)
-class CellResult:
-    """What is said of a finished cell."""
-
-    minutes: float
-    """Of training, validation and evaluation."""
-    identity: str
-    """Hash of the evaluation's identity."""
-    survival: float
-    """Mean over the evaluated episodes."""
-    episodes: int
-
-
 def prepare(folder: Path, cell: Cell) -> None:
     """Make the folder of a cell.
 
@@ -69,23 +62,15 @@ def prepare(folder: Path, cell: Cell) -> None:
         UsageError: it holds a cell of another definition.
     """
     wanted = json.loads(json.dumps(cell_to_dict(cell)))
-    path = folder / CELL_FILE
-    if not path.exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        write_json(path, wanted)
+    stored = read_cell(folder)
+    if stored is None:
+        write_cell(folder, wanted)
         return
-    stored = _read_json(path)
     for key, value in wanted.items():
         if stored.get(key) != value:
             raise UsageError(
                 f"{folder} holds a cell with another {key}: remove it, or choose another folder with --output."
             )
-
-
-def read_result(folder: Path) -> CellResult | None:
-    """The result of a finished cell; None if it is not finished."""
-    path = folder / RESULT_FILE
-    return CellResult(**_read_json(path)) if path.exists() else None
 
 
 def is_busy(folder: Path) -> bool:
@@ -123,7 +108,7 @@ def run_cell(folder: Path) -> None:
 
 
 def _finish(folder: Path) -> None:
-    cell = cell_from_dict(_read_json(folder / CELL_FILE))
+    cell = cell_from_dict(read_json(folder / CELL_FILE))
     agent: str | Path = cell.agent
     if cell.training is not None:
         agent = folder / RUN_FOLDER
@@ -149,7 +134,7 @@ def _finish(folder: Path) -> None:
         survival=result.summary.survival.value,
         episodes=len(result.episodes),
     )
-    write_json(folder / RESULT_FILE, vars(summary))
+    write_result(folder, summary)
 
 
 def _train(cell: Cell, training: Training, folder: Path) -> None:
@@ -239,36 +224,11 @@ def serve(do: Callable[[], None]) -> int:
     return FINISHED
 
 
-def trained_seconds(run: Path) -> float:
-    """Seconds that a run has taken so far, interruptions left out."""
-    path = run / METRICS_FILE
-    if not path.exists():
-        return 0.0
-    last = path.read_text(encoding="utf-8").strip().splitlines()[-1].split(",")
-    return float(last[2]) if last[2] != "wall_time" else 0.0
-
-
-def played_episodes(folder: Path) -> int:
-    """Episodes of the evaluation that are on disk."""
-    for name in (EPISODES_FILE, "episodes.partial.csv"):
-        path = folder / EVALUATION_FOLDER / name
-        if path.exists():
-            return max(path.read_text(encoding="utf-8").count("\n") - 1, 0)
-    return 0
-
-
 def last_error(folder: Path) -> str:
     """The last line that the processes of a cell printed."""
     path = folder / LOG_FILE
     lines = path.read_text(encoding="utf-8", errors="replace").split("\n") if path.exists() else []
     return next((line.strip() for line in reversed(lines) if line.strip()), "it left no message")
-
-
-def _read_json(path: Path) -> Any:
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, json.JSONDecodeError) as error:
-        raise UsageError(f"{path} cannot be read as part of a study: {error}.") from None
 
 
 def _interrupt(number: int, frame: object) -> None:

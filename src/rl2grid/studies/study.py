@@ -1,4 +1,4 @@
-"""Studies: many trainings and evaluations named in one TOML file.
+"""The file of a study: many trainings and evaluations named in TOML.
 
 A file has settings, scales of effort to choose from, and groups whose products are the cells of the study::
 
@@ -24,21 +24,20 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import fields
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from rl2grid.algorithms.registry import Hyperparameters, algorithm_names, find_algorithm
+from rl2grid.algorithms.registry import algorithm_names, find_algorithm
 from rl2grid.engines import HEURISTICS
 from rl2grid.envs.options import TaskOptions
 from rl2grid.envs.tasks import constraint_of, find_task
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import AGENTS, kinds_of
-from rl2grid.evaluation.protocol import evenly_spread
 from rl2grid.mdp.rewards import resolve_reward
-from rl2grid.records.collection import CELLS_FOLDER
 from rl2grid.scenarios.splits import SPLITS
+from rl2grid.studies.cells import Cell, Study, Training
 from rl2grid.studies.toml_file import (
     as_table,
     check_kind,
@@ -63,75 +62,6 @@ _STUDY_KEYS = ("name", "output", "retries", "scale", "group", "slurm")
 _PRODUCT_KEYS = ("label", "algorithms", "agents", "tasks", "heuristics", "hyperparameters", "environment")
 _SETTINGS = ("split", "preset", "seeds", "budget", "validations", "months", "evaluation_seeds")
 """May stand in a group, a scale or the study, and count in this order."""
-
-
-@dataclass(frozen=True)
-class Training:
-    """What a cell learns before it is evaluated."""
-
-    algorithm: str
-    seed: int
-    preset: str
-    hyperparameters: Mapping[str, Any]
-    """Changes of the preset, the budget (``total_timesteps``) among them."""
-    validations: int
-    """Evaluations on the validation scenarios, spread evenly over the budget."""
-
-    def resolved(self, task: str) -> Hyperparameters:
-        """All hyperparameters.
-
-        Raises:
-            UsageError: they cannot work, or not for this task.
-        """
-        return runs.hyperparameters(self.algorithm, task, self.preset, seed=self.seed, **self.hyperparameters)
-
-
-@dataclass(frozen=True)
-class Cell:
-    """One agent on one task: trained, if it learns, and evaluated."""
-
-    name: str
-    """Name of its folder, unique in the study."""
-    agent: str
-    """An agent without training, or the algorithm."""
-    task: str
-    heuristic: str | None
-    environment: Mapping[str, Any]
-    """Further keywords of ``gymnasium.make``."""
-    split: str
-    months: int | None
-    """Months of a split that are played, evenly spread over it; None: all."""
-    evaluation_seeds: int
-    """Episodes per month, with seeds 0, 1, ..."""
-    training: Training | None
-
-    @property
-    def decisions(self) -> int:
-        """Decisions to train for; 0 for agents that need no training."""
-        return self.training.resolved(self.task).total_timesteps if self.training else 0
-
-    @property
-    def scenarios(self) -> tuple[str, ...]:
-        """The months that are played."""
-        return evenly_spread(self.task, self.split, self.months)
-
-
-@dataclass(frozen=True)
-class Study:
-    """All cells of a study at one scale."""
-
-    name: str
-    output: Path
-    scale: str | None
-    retries: int
-    """How often a cell that failed is tried again."""
-    cells: tuple[Cell, ...]
-    slurm: Mapping[str, Any]
-    """Parameters of the Slurm jobs (submitit's)."""
-
-    def folder(self, cell: Cell) -> Path:
-        """Where a cell is kept."""
-        return self.output / CELLS_FOLDER / cell.name
 
 
 def included_studies() -> dict[str, Path]:
@@ -186,24 +116,6 @@ def parse_study(contents: Mapping[str, Any], scale: str | None = None, output: P
         cells=tuple(cells),
         slurm=table_of("the study", contents, "slurm"),
     )
-
-
-def cell_to_dict(cell: Cell) -> dict[str, Any]:
-    """A cell as it is stored in JSON."""
-    return asdict(cell)
-
-
-def cell_from_dict(stored: Mapping[str, Any]) -> Cell:
-    """The inverse of :func:`cell_to_dict`.
-
-    Raises:
-        TypeError: the entries are not those of a cell.
-    """
-    cell = {**stored, "environment": with_tuples(stored["environment"])}
-    if cell["training"] is not None:
-        training = cell["training"]
-        cell["training"] = Training(**{**training, "hyperparameters": with_tuples(training["hyperparameters"])})
-    return Cell(**cell)
 
 
 class _Group:

@@ -1,55 +1,20 @@
-"""Searching for hyperparameters: many short trainings, the poor ones ended early.
-
-A search is described by a TOML file (see ``docs/studies.md``) and kept in its output folder::
-
-    tuning.json     what is searched
-    journal.log     Optuna's journal: every trial, shared by all processes of the search
-    trials/<hash>/  one run folder per configuration
-    best.json       the best configuration
-
-A process may be killed at any moment. The same command goes on: a trial that was under way is put back at the head of
-the queue and its run resumed. ``python -m rl2grid.studies.tuning <folder>`` works on trials until there are enough.
-"""
+"""The file of a search for hyperparameters, a TOML file (see ``docs/studies.md``), checked before anything begins."""
 
 from __future__ import annotations
 
-import contextlib
-import hashlib
-import json
-import math
-import os
 import random
-import sys
-import time
-import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from filelock import FileLock, Timeout
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
-
-from rl2grid.algorithms.policy_agent import PolicyAgent
 from rl2grid.algorithms.registry import Hyperparameters, algorithm_names, find_algorithm
 from rl2grid.engines import HEURISTICS
 from rl2grid.envs.tasks import find_task
 from rl2grid.errors import UsageError
-from rl2grid.records.files import make_folder, write_json
-from rl2grid.records.trainings import read_validations
-from rl2grid.studies.cell import STOPPED, CellProcess, is_busy, serve
 from rl2grid.studies.study import NO_HEURISTIC
 from rl2grid.studies.toml_file import as_table, check_kind, count, read_toml, refuse_unknown_keys, text, unknown
 from rl2grid.training import runs
-from rl2grid.training.commands import train_command
-from rl2grid.training.interrupts import stop_requests
-from rl2grid.training.validation import validator
-
-TUNING_FILE, JOURNAL_FILE, BEST_FILE = "tuning.json", "journal.log", "best.json"
-TRIALS_FOLDER = "trials"
-COMMAND: tuple[str, ...] = (sys.executable, "-m", "rl2grid.studies.tuning")
 
 TRANSITIONS = "num_envs * num_steps"
 """Name of a parameter that the paper searched in place of ``num_steps``."""
@@ -117,17 +82,6 @@ class Tuning:
         return runs.hyperparameters(self.algorithm, self.task, self.preset, **fixed, **changes)
 
 
-@dataclass(frozen=True)
-class Best:
-    """The best configuration of a search."""
-
-    trial: int
-    survival: float
-    """Of its best policy by validation; under constraints that is the one most often safe."""
-    hyperparameters: Mapping[str, Any]
-    """Those that were searched."""
-
-
 def load_tuning(file: str, output: Path | None = None) -> Tuning:
     """Read and check a search.
 
@@ -188,135 +142,8 @@ def _default_space(algorithm: str, fixed: Mapping[str, Any]) -> dict[str, list[A
     return {name: values for name, values in search_space(algorithm).items() if name not in without}
 
 
-def run_tuning(
-    tuning: Tuning, jobs: int | None = None, console: Console | None = None, command: Sequence[str] = COMMAND
-) -> Best | None:
-    """Search until there are enough trials.
-
-    Args:
-        tuning: what to search.
-        jobs: processes that train at the same time; None: one per core.
-        console: where progress is shown; None: nowhere.
-        command: what works on trials of the folder given to it.
-
-    Returns:
-        The best configuration so far; None when an interrupt asked to stop.
-
-    Raises:
-        UsageError: Optuna is missing, the folder holds another search, or not all trials could be trained.
-    """
-    _optuna()
-    if jobs is not None and jobs < 1:
-        raise UsageError(f"--jobs {jobs} is not allowed: at least 1 is needed.")
-    _prepare(tuning)
-    with _only_one(tuning.output), stop_requests() as stop, _progress(tuning, console) as show:
-        _put_back_interrupted(tuning)
-        processes = [CellProcess(tuning.output, command) for _ in range(jobs or _cores())]
-        while any(process.poll() is None for process in processes):
-            if stop.is_set():
-                for process in processes:
-                    process.stop()
-                for process in processes:
-                    process.wait()
-                return None
-            show(_open(tuning))
-            stop.wait(1.0)
-        show(_open(tuning))
-    statuses = [process.wait() for process in processes]
-    best = _best(tuning)
-    if best is None or all(status not in (0, STOPPED) for status in statuses):
-        raise UsageError(f"The search failed: {tuning.output / 'log.txt'} says why.")
-    write_json(tuning.output / BEST_FILE, asdict(best) | {"command": best_command(tuning, best)})
-    ended = len(_ended(_open(tuning)))
-    if ended < tuning.trials:
-        raise UsageError(
-            f"The search stopped after {ended} of {tuning.trials} trials: {tuning.output / 'log.txt'} says why, and "
-            "the same command goes on."
-        )
-    return best
-
-
-def best_command(tuning: Tuning, best: Best) -> str:
-    """What to type to train with a configuration."""
-    args = _run_args(tuning, tuning.resolved(best.hyperparameters), None)
-    # Validated on all months, and not as often as while searching, where that is for ending poor trials.
-    args = replace(args, evaluate_every=runs.RunArgs.evaluate_every, validation_months=None)
-    return train_command(args, tuning.preset)
-
-
-def work(folder: Path) -> None:
-    """Train trials until the search has enough of them."""
-    optuna = _optuna()
-    stored = json.loads((folder / TUNING_FILE).read_text(encoding="utf-8"))
-    tuning = Tuning(**stored, output=folder)
-    study = _open(tuning)
-    locks = folder / ".locks"
-    locks.mkdir(exist_ok=True)
-    while (begun := _begin(tuning, study)) is not None:
-        trial, chosen = begun
-        # Of equal trials one trains; the others wait until it is told, and take what it reached.
-        with FileLock(locks / _trial_folder(tuning, chosen).name):
-            try:
-                reached = _train(tuning, trial, chosen)
-            except optuna.TrialPruned:
-                study.tell(trial, state=optuna.trial.TrialState.PRUNED)
-            else:
-                study.tell(trial, reached)
-
-
-def _begin(tuning: Tuning, study: Any) -> tuple[Any, dict[str, Any]] | None:
-    """Begin a trial; returns it and its choices, None if there are enough trials."""
-    states = _optuna().trial.TrialState
-    # All that are under way count, so that parallel processes do not begin more than asked for.
-    counted = (states.COMPLETE, states.PRUNED, states.RUNNING)
-    with FileLock(tuning.output / ".begin.lock"):
-        number = sum(trial.state in counted for trial in study.get_trials(deepcopy=False))
-        if number >= tuning.trials:
-            return None
-        # A seed for every trial: neither do parallel processes draw the same, nor does one that goes on draw it again.
-        study.sampler = _sampler(np.random.SeedSequence((tuning.seed, number)).generate_state(1).item())
-        trial = study.ask()
-        kinds = _kinds(tuning)
-        return trial, {name: _suggest(trial, name, values, kinds[name]) for name, values in tuning.space.items()}
-
-
-def _train(tuning: Tuning, trial: Any, chosen: Mapping[str, Any]) -> float:
-    """Train one configuration; returns its best score in validation."""
-    optuna = _optuna()
-    try:
-        hyperparameters = tuning.resolved(chosen)
-    except UsageError as error:
-        trial.set_user_attr("refused", str(error))
-        raise optuna.TrialPruned from None
-    folder = _trial_folder(tuning, chosen)
-    trial.set_user_attr("run", folder.name)
-    args = _run_args(tuning, hyperparameters, folder)
-    validate = validator(args)
-    reports = Reports(trial, folder, runs.find_limits(args))
-    if _was_pruned(trial.study, folder):
-        raise optuna.TrialPruned
-
-    def report(agent: PolicyAgent) -> Mapping[str, float]:
-        result = validate(agent)
-        reports.add(agent.identity["decisions"], result)
-        return result
-
-    if not folder.exists():
-        runs.train(args, evaluate=report)
-    elif not runs.is_finished(folder):
-        runs.resume(folder, evaluate=report)
-    if not runs.is_finished(folder):
-        raise KeyboardInterrupt
-    return reports.best
-
-
-def _was_pruned(study: Any, folder: Path) -> bool:
-    """Whether a trial with this run was ended early."""
-    pruned = study.get_trials(deepcopy=False, states=[_optuna().trial.TrialState.PRUNED])
-    return any(trial.user_attrs.get("run") == folder.name for trial in pruned)
-
-
-def _run_args(tuning: Tuning, hyperparameters: Hyperparameters, folder: Path | None) -> runs.RunArgs:
+def run_args(tuning: Tuning, hyperparameters: Hyperparameters, folder: Path | None) -> runs.RunArgs:
+    """The training of a trial, in ``folder``; None: the usual one."""
     return runs.RunArgs(
         task=tuning.task,
         hyperparameters=hyperparameters,
@@ -331,135 +158,10 @@ def _run_args(tuning: Tuning, hyperparameters: Hyperparameters, folder: Path | N
     )
 
 
-class Reports:
-    """What a trial tells of its course, that before an interruption included."""
-
-    def __init__(self, trial: Any, folder: Path, limits: Mapping[str, float]) -> None:
-        self._trial = trial
-        self._limits = limits
-        self._told: set[int] = set()
-        self.best = -math.inf
-        """See :func:`one_score`."""
-        for decisions, means in read_validations(folder).items():
-            self._tell(decisions, means)
-
-    def add(self, decisions: int, means: Mapping[str, float]) -> None:
-        """Report a validation.
-
-        Raises:
-            optuna.TrialPruned: others were better by then.
-        """
-        self._tell(decisions, means)
-        if self._trial.should_prune():
-            raise _optuna().TrialPruned
-
-    def _tell(self, decisions: int, means: Mapping[str, float]) -> None:
-        reached = one_score(means, self._limits)
-        if reached >= self.best:
-            self.best = reached
-            self._trial.set_user_attr("survival", float(means["survival"]))
-        if decisions not in self._told:
-            self._told.add(decisions)
-            self._trial.report(self.best, decisions)
-
-
-def one_score(means: Mapping[str, float], limits: Mapping[str, float]) -> float:
-    """:func:`rl2grid.training.runs.score` as one number in the same order, as searches need it.
-
-    Shares of safe episodes of fewer than 1,000 episodes differ by more than the last weight.
-    """
-    first, *then = runs.score(means, limits)
-    return first + sum(1e-3 * value for value in then)
-
-
-def _suggest(trial: Any, name: str, values: Any, kind: Any) -> Any:
-    if isinstance(values, list):
-        # A journal keeps no lists: layers are chosen by their number in the file.
-        if any(isinstance(value, list) for value in values):
-            return values[trial.suggest_categorical(f"number of {name}", tuple(range(len(values))))]
-        return trial.suggest_categorical(name, tuple(values))
-    low, high, log = values["low"], values["high"], values.get("log", False)
-    if kind is int:
-        return trial.suggest_int(name, low, high, log=log)
-    return trial.suggest_float(name, low, high, log=log)
-
-
-def _open(tuning: Tuning) -> Any:
-    """Optuna's study, which all processes of the search share."""
-    optuna = _optuna()
-    from optuna.storages.journal import JournalFileBackend
-
-    storage = optuna.storages.JournalStorage(JournalFileBackend(str(tuning.output / JOURNAL_FILE)))
-    return optuna.create_study(
-        storage=storage,
-        study_name=tuning.name,
-        direction="maximize",
-        load_if_exists=True,
-        pruner=optuna.pruners.MedianPruner(n_startup_trials=5, n_warmup_steps=tuning.budget // 5),
-    )
-
-
-def _sampler(seed: int) -> Any:
-    # Processes that sample at the same time must not sample the same.
-    return _optuna().samplers.TPESampler(constant_liar=True, seed=seed)
-
-
-def _put_back_interrupted(tuning: Tuning) -> None:
-    """Queue the trials that a killed process left, which is known because no other process searches."""
-    state = _optuna().trial.TrialState
-    study = _open(tuning)
-    for trial in study.get_trials(deepcopy=False):
-        if trial.state == state.RUNNING:
-            # Its process may live a little longer than the one that started it, to write a checkpoint.
-            while is_busy(tuning.output / TRIALS_FOLDER / trial.user_attrs.get("run", "none")):
-                time.sleep(0.2)
-            study.tell(trial.number, state=state.FAIL)
-            if trial.params:
-                study.enqueue_trial(trial.params)
-
-
-def _ended(study: Any) -> list[Any]:
-    """The trials that count: complete, or ended because they were poor."""
-    states = _optuna().trial.TrialState
-    ended: list[Any] = study.get_trials(deepcopy=False, states=[states.COMPLETE, states.PRUNED])
-    return ended
-
-
-def _best(tuning: Tuning) -> Best | None:
-    study, state = _open(tuning), _optuna().trial.TrialState.COMPLETE
-    done = [trial for trial in study.get_trials(deepcopy=False) if trial.state == state]
-    if not done:
-        return None
-    trial = max(done, key=lambda each: (each.value, -each.number))
-    chosen = {
-        name.removeprefix("number of "): tuning.space[name.removeprefix("number of ")][value]
-        if name.startswith("number of ")
-        else value
-        for name, value in trial.params.items()
-    }
-    return Best(trial.number, trial.user_attrs["survival"], chosen)
-
-
-def _prepare(tuning: Tuning) -> None:
-    wanted = {key: value for key, value in asdict(tuning).items() if key != "output"}
-    path = tuning.output / TUNING_FILE
-    if path.exists():
-        stored = json.loads(path.read_text(encoding="utf-8"))
-        for key, value in json.loads(json.dumps(wanted)).items():
-            # More trials of the same search are welcome.
-            if key != "trials" and stored.get(key) != value:
-                raise UsageError(
-                    f"{tuning.output} holds a search with another {key}: remove it, or choose another folder with "
-                    "--output."
-                )
-    make_folder(tuning.output)
-    write_json(path, wanted)
-
-
 def _check_space(tuning: Tuning) -> None:
     if not tuning.space:
         raise UsageError("A search needs a [space] with at least one hyperparameter, such as gamma = [0.9, 0.99].")
-    kinds = _kinds(tuning)
+    kinds = kinds_of(tuning)
     allowed = [name for name in kinds if name not in ("seed", "total_timesteps")]
     for name in (*tuning.space, *tuning.hyperparameters):
         if name not in allowed:
@@ -482,7 +184,7 @@ def _check_space(tuning: Tuning) -> None:
             check_kind(f"each choice for {name}", choice, kinds[name])
 
 
-def _kinds(tuning: Tuning) -> dict[str, Any]:
+def kinds_of(tuning: Tuning) -> dict[str, Any]:
     """Type hint of every name that a search may hold."""
     return {**find_algorithm(tuning.algorithm).type_hints(), TRANSITIONS: int}
 
@@ -519,7 +221,7 @@ def _check_choices(tuning: Tuning) -> None:
 def _refusal(tuning: Tuning, chosen: Mapping[str, Any]) -> UsageError | None:
     """Why a configuration cannot be trained; None if it can."""
     try:
-        runs.find_limits(_run_args(tuning, tuning.resolved(chosen), None))
+        runs.find_limits(run_args(tuning, tuning.resolved(chosen), None))
     except UsageError as error:
         return error
     return None
@@ -531,53 +233,3 @@ def _is_range(values: Any) -> bool:
     low, high, log = values["low"], values["high"], values.get("log", False)
     numbers = all(isinstance(value, int | float) and not isinstance(value, bool) for value in (low, high))
     return numbers and isinstance(log, bool) and low < high and (low > 0 or not log)
-
-
-def _trial_folder(tuning: Tuning, chosen: Mapping[str, Any]) -> Path:
-    digest = hashlib.sha256(json.dumps(chosen, sort_keys=True).encode()).hexdigest()[:12]
-    return tuning.output / TRIALS_FOLDER / digest
-
-
-def _optuna() -> Any:
-    try:
-        import optuna
-    except ImportError:
-        raise UsageError("A search needs Optuna: `pip install rl2grid[tune]` installs it.") from None
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
-    warnings.filterwarnings("ignore", category=optuna.exceptions.ExperimentalWarning)
-    return optuna
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0))
-
-
-@contextlib.contextmanager
-def _only_one(folder: Path) -> Iterator[None]:
-    try:
-        with FileLock(folder / ".search.lock").acquire(timeout=0):
-            yield
-    except Timeout:
-        raise UsageError(f"Another process searches in {folder}: wait for it, or choose another folder.") from None
-
-
-@contextlib.contextmanager
-def _progress(tuning: Tuning, console: Console | None) -> Iterator[Any]:
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[best]}"))
-    with Progress(*columns, console=console, disable=console is None) as bar:
-        task = bar.add_task(f"{tuning.algorithm} on {tuning.task}", total=tuning.trials, best="")
-        began = time.monotonic()
-
-        def show(study: Any) -> None:
-            ended = _ended(study)
-            best_so_far = _best(tuning)
-            best = f"best survival {best_so_far.survival:.3f}, " if best_so_far else ""
-            pruned = sum(trial.state.name == "PRUNED" for trial in ended)
-            minutes = (time.monotonic() - began) / 60.0
-            bar.update(task, completed=len(ended), best=f"{best}{pruned} ended early, {minutes:.0f} min")
-
-        yield show
-
-
-if __name__ == "__main__":
-    sys.exit(serve(lambda: work(Path(sys.argv[1]))))

@@ -12,16 +12,13 @@ Of a process that was killed, what came after its last checkpoint is missing.
 
 from __future__ import annotations
 
-import json
 import resource
 import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rl2grid.records.files import write_json
-
-ENERGY_FILE = "energy.json"
+from rl2grid.records.trainings import read_energy, write_energy
 
 WATTS_PER_CORE = 12.0
 """Power of a busy core in W: an assumption, thermal design power by number of cores of common processors."""
@@ -50,8 +47,8 @@ class EnergyAccount:
 
     def __init__(self, folder: Path) -> None:
         """Begin to count; earlier parts are kept."""
-        self._path = folder / ENERGY_FILE
-        self._earlier = json.loads(self._path.read_text(encoding="utf-8"))["parts"] if self._path.exists() else []
+        self._folder = folder
+        self._earlier = (read_energy(folder) or {"parts": []})["parts"]
         self._tracker = _started_tracker()
         self._began = time.perf_counter()
         self._processor_began = _processor_seconds()
@@ -84,15 +81,14 @@ class EnergyAccount:
             "assumptions": _ASSUMPTIONS,
             "parts": parts,
         }
-        write_json(self._path, account)
+        write_energy(self._folder, account)
 
 
 def energy_line(folder: Path) -> str | None:
     """Energy and CO2 of a run in words; None if it has no account."""
-    path = folder / ENERGY_FILE
-    if not path.exists():
+    account = read_energy(folder)
+    if account is None:
         return None
-    account = json.loads(path.read_text(encoding="utf-8"))
     return f"{account['energy_kwh']:.3g} kWh, {account['co2_kg']:.3g} kg CO2 ({account['method']})"
 
 

@@ -18,7 +18,6 @@ the same metrics as one that was not (times apart), on the same machine with the
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -30,7 +29,6 @@ from typing import Any
 
 import gymnasium
 from filelock import FileLock, Timeout
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from rl2grid.algorithms.checkpoint import load_checkpoint, save_checkpoint
 from rl2grid.algorithms.metrics import MetricsWriter
@@ -50,16 +48,16 @@ from rl2grid.errors import UsageError, one_of
 from rl2grid.evaluation.protocol import evenly_spread
 from rl2grid.mdp.actions import action_set_hash
 from rl2grid.mdp.constraints import THRESHOLDS
-from rl2grid.records.files import make_folder
+from rl2grid.records.trainings import RUN_FILE, create_run_folder, read_configuration
 from rl2grid.records.versions import library_versions
 from rl2grid.scenarios.library import check_in_split, generator_version, scenario_pack_hash
 from rl2grid.scenarios.splits import TRAIN, VALIDATION
 from rl2grid.training.energy import EnergyAccount
 from rl2grid.training.interrupts import stop_requests
 from rl2grid.training.limits import TimeLimit
+from rl2grid.training.progress import progress_bar
 from rl2grid.training.tracking import check_tracking, tracked
 
-CONFIG_FILE = "config.json"
 LOG_FILE = "log.txt"
 LOCK_FILE = ".lock"
 REPLAY_FOLDER = "replay"
@@ -197,7 +195,7 @@ def train(
     try:
         trainer = find_algorithm(args.algorithm).trainer(args.hyperparameters, envs)
         identity = _identity(args)
-        _create_folder(folder, args, identity)
+        create_run_folder(folder, _configuration(args, identity))
         with _locked(folder):
             _run(_Run(folder, args, identity, trainer, evaluate), envs, limit, None)
     finally:
@@ -248,18 +246,19 @@ def read_config(folder: Path) -> tuple[RunArgs, dict[str, Any]]:
     Raises:
         UsageError: the folder holds no run.
     """
-    path = folder / CONFIG_FILE
     try:
-        config = json.loads(path.read_text(encoding="utf-8"))
+        config = read_configuration(folder)
         request = dict(config["request"])
         algorithm = find_algorithm(request["algorithm"])
         request["hyperparameters"] = algorithm.args(**_tuples(request["hyperparameters"]))
         request["env_keywords"] = _tuples(request["env_keywords"])
         return RunArgs(**request, folder=folder), config["identity"]
     except FileNotFoundError as error:
-        raise UsageError(f"Folder {str(folder)!r} holds no run: there is no {CONFIG_FILE} in it.") from error
+        raise UsageError(f"Folder {str(folder)!r} holds no run: there is no {RUN_FILE} in it.") from error
     except (json.JSONDecodeError, KeyError, TypeError) as error:
-        raise UsageError(f"File {str(path)!r} does not describe a run of this version of rl2grid.") from error
+        raise UsageError(
+            f"File {str(folder / RUN_FILE)!r} does not describe a run of this version of rl2grid."
+        ) from error
 
 
 def is_finished(folder: Path) -> bool:
@@ -361,12 +360,13 @@ def _run(run: _Run, envs: VectorEnvironment, limit: TimeLimit, checkpoint: Mappi
     after_step = trainer.decisions if checkpoint is not None else -1
     saved_at, saved_decisions = time.monotonic(), trainer.decisions
     config = {"request": _request(args), "identity": dict(run.identity)}
+    title = f"{args.algorithm} on {args.task}"
     with (
         closing(MetricsWriter(run.folder, after_step=after_step, tensorboard=args.tensorboard)) as metrics,
         tracked(run.folder, args.wandb_project, config) as track,
         _accounted(run.folder, trainer, envs) as energy,
         stop_requests() as stop,
-        _progress_bar(args, trainer) as show,
+        progress_bar(title, trainer.decisions, _budget(args, trainer), shown=args.progress) as show,
     ):
         while not trainer.finished and not stop.is_set():
             began, decisions, grid_steps = time.perf_counter(), trainer.decisions, trainer.grid_steps
@@ -381,7 +381,7 @@ def _run(run: _Run, envs: VectorEnvironment, limit: TimeLimit, checkpoint: Mappi
             run.wall_time += time.perf_counter() - began
             metrics.write(trainer.decisions, trainer.grid_steps, run.wall_time, values)
             track(trainer.decisions, values)
-            show(values.get("charts/survival"), run.best_survival)
+            show(trainer.decisions, values.get("charts/survival"), run.best_survival)
             if validated or time.monotonic() - saved_at >= args.checkpoint_seconds:
                 run.save()
                 energy.save()
@@ -411,39 +411,6 @@ def _accounted(folder: Path, trainer: Trainer, envs: VectorEnvironment) -> Itera
 def _budget(args: RunArgs, trainer: Trainer) -> int:
     """Decisions of the whole run: the largest number of full iterations within the request."""
     return trainer.num_iterations * args.hyperparameters.num_envs * args.hyperparameters.num_steps
-
-
-@contextmanager
-def _progress_bar(args: RunArgs, trainer: Trainer) -> Iterator[Callable[[float | None, float | None], None]]:
-    """A bar with rate, ETA and survival; yields what to call after every iteration."""
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("decisions, {task.fields[rate]}/s, survival {task.fields[survival]}, best {task.fields[best]}, ETA"),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, disable=not args.progress) as progress:
-        bar = progress.add_task(
-            f"{args.algorithm} on {args.task}",
-            total=_budget(args, trainer),
-            completed=trainer.decisions,
-            rate="-",
-            survival="-",
-            best="-",
-        )
-        began, first = time.perf_counter(), trainer.decisions
-
-        def show(survival: float | None, best: float | None) -> None:
-            progress.update(
-                bar,
-                completed=trainer.decisions,
-                rate=f"{(trainer.decisions - first) / (time.perf_counter() - began):.0f}",
-                survival="-" if survival is None else f"{survival:.2f}",
-                best="-" if best is None else f"{best:.2f}",
-            )
-
-        yield show
 
 
 def _resolved(args: RunArgs) -> RunArgs:
@@ -504,22 +471,12 @@ def _identity(args: RunArgs) -> dict[str, Any]:
     }
 
 
-def _create_folder(folder: Path, args: RunArgs, identity: Mapping[str, Any]) -> None:
-    """Make the run folder with its configuration: it appears complete or not at all."""
+def _configuration(args: RunArgs, identity: Mapping[str, Any]) -> dict[str, Any]:
     seeds = {
         "algorithm": args.hyperparameters.seed,
         "first_environment": args.hyperparameters.seed * args.hyperparameters.num_envs,
     }
-    config = {"request": _request(args), "identity": dict(identity), "seeds": seeds}
-    make_folder(folder.parent)
-    temporary = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
-    try:
-        temporary.mkdir()
-        (temporary / CONFIG_FILE).write_text(json.dumps(config, indent=2) + "\n", encoding="utf-8")
-        os.rename(temporary, folder)
-    except OSError as error:
-        shutil.rmtree(temporary, ignore_errors=True)
-        raise UsageError(f"Folder {str(folder)!r} cannot be made: {error.strerror}.") from error
+    return {"request": _request(args), "identity": dict(identity), "seeds": seeds}
 
 
 def _request(args: RunArgs) -> dict[str, Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import json
 import uuid
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -11,9 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from rl2grid.errors import UsageError
-from rl2grid.records.files import write_json
+from rl2grid.records.trainings import read_tracking, write_tracking
 
-TRACKING_FILE = "wandb.json"
 """In a run folder: the id under which Weights & Biases knows the run."""
 
 Track = Callable[[int, Mapping[str, float]], None]
@@ -75,7 +73,4 @@ def _wandb() -> Any:
 
 def _run_id(folder: Path) -> str:
     """The id stored in the run folder; a new one, if there is none yet."""
-    path = folder / TRACKING_FILE
-    if not path.exists():
-        write_json(path, {"id": uuid.uuid4().hex[:12]}, indent=None)
-    return str(json.loads(path.read_text(encoding="utf-8"))["id"])
+    return read_tracking(folder) or write_tracking(folder, uuid.uuid4().hex[:12])

@@ -1,0 +1,80 @@
+"""What an evaluation shows of its course."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+
+import rich.progress
+
+from rl2grid.evaluation.crew import Job, Progress, Setting
+from rl2grid.records.episodes import Episode
+
+
+class Display:
+    """Tells of the course of an evaluation; this one keeps silent."""
+
+    def skip(self, jobs: Iterable[Job]) -> None:
+        """These were played in an earlier call."""
+
+    def advance(self, progress: Progress) -> None:
+        """An episode is under way."""
+
+    def finish(self, episode: Episode) -> None:
+        """An episode ended."""
+
+
+class ProgressBar(Display):
+    """Episodes done, grid steps per second, remaining time."""
+
+    def __init__(self, bar: rich.progress.Progress, setting: Setting, n_jobs: int) -> None:
+        self._bar = bar
+        self._began = time.monotonic()
+        self._shares: dict[Job, float] = {}
+        self._steps: dict[Job, int] = {}
+        self._finished = 0
+        self._n_jobs = n_jobs
+        self._id = bar.add_task(f"Evaluating {setting.agent.name}", total=n_jobs, rate="", count=f"0/{n_jobs}")
+
+    def skip(self, jobs: Iterable[Job]) -> None:
+        self._shares |= dict.fromkeys(jobs, 1.0)
+        self._finished = len(self._shares)
+        self._show()
+
+    def advance(self, progress: Progress) -> None:
+        self._shares[progress.job] = progress.grid_steps / progress.episode_length
+        self._steps[progress.job] = progress.grid_steps
+        self._show()
+
+    def finish(self, episode: Episode) -> None:
+        job = Job(episode.scenario, episode.seed, episode.start)
+        self._shares[job], self._steps[job] = 1.0, episode.grid_steps
+        self._finished += 1
+        self._show()
+
+    def _show(self) -> None:
+        rate = sum(self._steps.values()) / max(time.monotonic() - self._began, 1e-3)
+        self._bar.update(
+            self._id,
+            completed=sum(self._shares.values()),
+            rate=f"{rate:,.0f} grid steps/s",
+            count=f"{self._finished}/{self._n_jobs} episodes",
+        )
+
+
+@contextmanager
+def show_progress(setting: Setting, jobs: Sequence[Job], progress: bool) -> Iterator[Display]:
+    """What to tell of the course of an evaluation, with a bar or without."""
+    if not progress:
+        yield Display()
+        return
+    columns = (
+        rich.progress.TextColumn("{task.description}"),
+        rich.progress.BarColumn(),
+        rich.progress.TextColumn("{task.fields[count]}"),
+        rich.progress.TextColumn("{task.fields[rate]}"),
+        rich.progress.TimeRemainingColumn(),
+    )
+    with rich.progress.Progress(*columns) as bar:
+        yield ProgressBar(bar, setting, len(jobs))
