@@ -1,0 +1,75 @@
+"""Tests that are played once, and verified by playing again."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sample_results import result
+
+from rl2grid.cli.main import main
+from rl2grid.errors import UsageError
+from rl2grid.ledger import subjects
+from rl2grid.ledger.subjects import find_subject, play_test
+from rl2grid.records.ledger import read_ledger
+
+
+@pytest.fixture
+def played(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+    """What was asked of the protocol, which answers with a made-up evaluation."""
+    asked: list[dict[str, Any]] = []
+
+    def evaluate(agent: str, task: str, **options: Any):
+        asked.append({"agent": agent, "task": task, **options})
+        return result(agent, [[0.5], [1.0]], options["heuristic"])
+
+    monkeypatch.setattr(subjects, "evaluate", evaluate)
+    return asked
+
+
+def test_an_agent_without_training_is_named_with_its_task(played):
+    subject = find_subject("random@bus14-T0:idle")
+    assert subject.configuration == {"agent": "random", "task": "rl2grid/bus14-T0-v0", "heuristic": "idle"}
+    assert subject.digest == "21bd7f217588a3cd"  # as it stands in the ledger of the baselines
+    play_test(subject)
+    assert (played[0]["split"], played[0]["heuristic"]) == ("test", "idle")
+    with pytest.raises(UsageError, match="Task"):
+        find_subject("random@bus15-T0")
+
+
+def test_a_configuration_is_tested_once_and_verified_as_often_as_asked(played, tmp_path: Path, capsys):
+    ledger = tmp_path / "ledger.json"
+    words = ["greedy@bus14-T0", "--ledger", str(ledger)]
+    assert main(["leaderboard", "test", *words]) == 0
+    before = ledger.read_bytes()
+    assert main(["leaderboard", "test", *words]) == 0
+    assert len(played) == 1
+    assert "has had its test: see ledger.json." in capsys.readouterr().out
+    assert main(["leaderboard", "verify", *words]) == 0
+    assert capsys.readouterr().out == "greedy on bus14-T0, heuristic None: the same, bit for bit.\n"
+    assert ledger.read_bytes() == before
+    assert main(["leaderboard", "table", "--ledger", str(ledger)]) == 0
+    assert "| bus14-T0 | greedy | none |" in capsys.readouterr().out
+    assert len(read_ledger(ledger)) == 1
+
+
+def test_what_differs_is_named(played, tmp_path: Path, capsys):
+    ledger = tmp_path / "ledger.json"
+    words = ["greedy@bus14-T0", "--ledger", str(ledger)]
+    main(["leaderboard", "test", *words])
+    contents = json.loads(ledger.read_text())
+    (stored,) = contents.values()
+    stored["episodes_hash"] = "0" * 16
+    stored["test"]["survival"][0] += 0.0001
+    ledger.write_text(json.dumps(contents))
+    assert main(["leaderboard", "verify", *words]) == 1
+    assert "differs in episodes_hash, test." in capsys.readouterr().out
+    assert main(["leaderboard", "verify", "random@bus14-T0", "--ledger", str(ledger)]) == 2
+    assert "The ledger has no test of 'random'" in capsys.readouterr().err
+
+
+def test_what_is_no_finished_run_has_no_test(tmp_path: Path):
+    with pytest.raises(UsageError, match="holds no run"):
+        find_subject(str(tmp_path))

@@ -1,0 +1,52 @@
+"""The ledger of test results: what is kept, and that what is stored stays as it is."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from sample_results import result
+
+from rl2grid.errors import UsageError
+from rl2grid.records.evaluations import identity_hash
+from rl2grid.records.ledger import enter, read_ledger, result_of
+
+LEDGER = Path(__file__).parents[2] / "benchmarks" / "results" / "baselines.json"
+CONFIGURATION = {"agent": "greedy", "task": "rl2grid/bus14-T0-v0", "heuristic": "idle"}
+
+
+def test_what_is_kept_of_an_evaluation():
+    kept = result_of(CONFIGURATION, {}, result("greedy", [[0.5], [1.0]]))
+    assert kept.test["episodes"] == 2
+    assert kept.test["survival"][0] == 0.75
+    assert (kept.agent, kept.heuristic) == ("greedy", "idle")
+    other = result_of(CONFIGURATION, {}, result("greedy", [[0.5], [0.9]]))
+    assert other.episodes_hash != kept.episodes_hash
+
+
+def test_results_come_back_by_their_configuration(tmp_path: Path):
+    path = tmp_path / "ledger.json"
+    assert read_ledger(path) == {}
+    kept = result_of(CONFIGURATION, {}, result("greedy", [[0.5], [1.0]]))
+    enter(path, kept)
+    assert read_ledger(path) == {identity_hash(CONFIGURATION): kept}
+
+
+def test_the_ledger_of_the_baselines_keeps_its_bytes(tmp_path: Path):
+    """Read and written again it is the same file, and every result stands under the hash of its configuration."""
+    results = read_ledger(LEDGER)
+    assert len(results) > 100
+    path = tmp_path / "ledger.json"
+    for digest, kept in results.items():
+        assert digest == identity_hash(kept.configuration)
+    path.write_text(LEDGER.read_text())
+    enter(path, results[next(iter(results))])
+    assert path.read_bytes() == LEDGER.read_bytes()
+
+
+@pytest.mark.parametrize("text", ["[]", "{", json.dumps({"a": {"configuration": {}}})])
+def test_other_files_are_refused(tmp_path: Path, text: str):
+    (tmp_path / "ledger.json").write_text(text)
+    with pytest.raises(UsageError, match="cannot be read as a ledger"):
+        read_ledger(tmp_path / "ledger.json")
