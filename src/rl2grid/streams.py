@@ -22,6 +22,7 @@ class Purpose(enum.IntEnum):
     OPPONENT = 3
     AGENT = 4
     SERIES = 5
+    IMAGINATION = 6
 
 
 class Stream:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
+from rl2grid.engines.worlds import World
 from rl2grid.grids import Grid
 from rl2grid.mdp.actions import StepAction
 from rl2grid.mdp.state import GridState
@@ -34,6 +35,27 @@ class Engine(Protocol):
 
         Raises:
             UsageError: the scenario has no forecast for that horizon.
+        """
+
+    def save(self, i: int) -> World:
+        """Everything of environment ``i`` at this moment.
+
+        Raises:
+            UsageError: it was not reset yet.
+        """
+
+    def restore(self, i: int, world: World) -> None:
+        """Bring environment ``i`` to where ``world`` was saved: what follows is what followed there, bit for bit.
+
+        Raises:
+            UsageError: the world is of another grid or of an engine made otherwise, or its series is not to be had.
+        """
+
+    def imagine(self, i: int, seed: int) -> World:
+        """A world that goes on from here as far as an operator may know; ``seed``: of the opponent's draws.
+
+        Raises:
+            UsageError: there is no episode in progress, or the engine cannot imagine.
         """
 
     def close(self) -> None:

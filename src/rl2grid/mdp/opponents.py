@@ -100,6 +100,10 @@ class OpponentState(NamedTuple):
     ]
     area_line: Annotated[I32, row("area", "line last chosen, -1 if none", blank=-1)]
 
+    # What anybody can see of it.
+    lasted: Annotated[I32, row("area", "for which an attack is under way, 0 if none is", "steps", blank=0)]
+    waited: Annotated[I32, row("area", "at which one could have begun since, and did not", "steps", blank=0)]
+
     # Output of a step.
     attacked: Annotated[Flags, scratch("line", "opened by the opponent in this step", blank=0)]
     cooldown_written: Annotated[I32, scratch("line", "the cooldown becomes at least this", "steps", blank=0)]
@@ -201,6 +205,71 @@ def load_draws(opponent: OpponentState, i: int, draws: OpponentDraws) -> None:
         getattr(opponent, name)[i, :, :most] = getattr(draws, name)[:, :most]
 
 
+def imagine_opponent(
+    opponent: OpponentState, i: int, grid: Grid, stream: Stream, n_steps: int, attacked: Flags, cooldown_line: I32
+) -> None:
+    """Replace all that nobody can know of the opponent of environment ``i`` by draws from what is published of it.
+
+    Budget, cooldown and attacks under way stay: they follow from what was seen. Of an attack under way, a ``weighted``
+    or ``geometric`` opponent has shown the end, in the cooldown of the lines; a ``multi_area`` one has not, and its end
+    is drawn, given how long it has lasted. When the next attack comes is drawn, given how long there was none.
+
+    Args:
+        opponent: The opponents.
+        i: The environment.
+        grid: Whose ``opponent`` is published.
+        stream: Of the draws.
+        n_steps: Steps left of the episode.
+        attacked: bool [line], out by the opponent in the last step.
+        cooldown_line: int32 [line], as last observed.
+    """
+    config = grid.opponent
+    n_areas = len(config.areas)
+    ends, begins = stream.uniform(2 * n_areas).reshape(2, n_areas)
+    draws = draw_opponent(grid, stream, n_steps)
+    opponent.n_attacks[i] = draws.n_attacks
+    for name in ("waits", "durations", "choices"):
+        drawn, kept = getattr(draws, name), getattr(opponent, name)[i]
+        room = min(drawn.shape[1], kept.shape[1])
+        kept[:] = 0
+        kept[:, :room] = drawn[:, :room]
+    opponent.attack_counter[i] = 0
+    opponent.previous_fails[i] = False
+    opponent.attack_duration[i] = _duration_left(config, attacked, cooldown_line)
+    for area, lines in enumerate(config.areas):
+        hit = [line for line in lines if attacked[line]]
+        opponent.area_line[i, area] = hit[0] if hit else -1
+        opponent.area_duration[i, area] = -1
+        if hit and config.kind == "multi_area":
+            opponent.area_duration[i, area] = _area_steps_left(config, int(opponent.lasted[i, area]), ends[area])
+        opponent.next_attack_time[i, area] = _steps_to_attack(config, int(opponent.waited[i, area]), begins[area])
+
+
+def _duration_left(config: OpponentConfig, attacked: Flags, cooldown_line: I32) -> int:
+    """``current_attack_duration`` as far as it was seen."""
+    if not attacked.any():
+        return 0
+    if config.kind == "multi_area":
+        return 1
+    # The cooldown was counted down after the attack had written it; switching the line may have made it longer.
+    return min(config.max_duration, int(cooldown_line[attacked].min()) + 1)
+
+
+def _area_steps_left(config: OpponentConfig, lasted: int, uniform: float) -> int:
+    """How many more steps an attack takes that has lasted so many, the first one included (``multi_area``)."""
+    more = int(_geometric(np.array([uniform]), config.recovery_rate)[0])
+    certain = config.minimum_duration + 1 - lasted
+    return certain + more if certain >= 0 else more - 1
+
+
+def _steps_to_attack(config: OpponentConfig, waited: int, uniform: float) -> int:
+    """Asked for the how-manieth time from now on, the opponent attacks, if it was asked so often before in vain."""
+    if config.kind == "weighted":
+        return 1 + int(uniform * max(config.attack_period - waited, 1))
+    wait = int(_geometric(np.array([uniform]), config.hazard_rate)[0])
+    return wait if waited else 1 + wait
+
+
 @jit
 def opponent_step(state: GridState, opponent: OpponentState, i: int) -> None:
     """The opponent's part in a step of environment ``i``.
@@ -221,6 +290,7 @@ def attack(opponent: OpponentState, i: int, rho: F32, line_status: Flags) -> Non
     _earn_budget(opponent, i)
     opponent.attack_duration[i] = max(0, opponent.attack_duration[i] - 1)
     opponent.attack_cooldown[i] = max(0, opponent.attack_cooldown[i] - 1)
+    asked = False
     if opponent.attack_duration[i] > 0:
         n_attacked = _mark_attacked(opponent, i)
         _tell_attack_continues(opponent, i)
@@ -228,7 +298,9 @@ def attack(opponent: OpponentState, i: int, rho: F32, line_status: Flags) -> Non
         n_attacked = 0
         _tell_attack_continues(opponent, i)
     else:
+        asked = True
         n_attacked = _ask_for_attack(opponent, i, rho, line_status)
+    _note_seen(opponent, i, asked)
     if n_attacked == 0:
         return
     opponent.budget[i] -= n_attacked
@@ -284,6 +356,19 @@ def _mark_attacked(opponent: OpponentState, i: int) -> int:
             opponent.attacked[i, line] = True
             n_attacked += 1
     return n_attacked
+
+
+@jit
+def _note_seen(opponent: OpponentState, i: int, asked: bool) -> None:
+    """Count for how long each area is under attack, or has been left alone although it could be attacked."""
+    for area in range(opponent.area_line.shape[1]):
+        line = opponent.area_line[i, area]
+        if line >= 0 and opponent.attacked[i, line]:
+            opponent.lasted[i, area] += 1
+            opponent.waited[i, area] = 0
+        else:
+            opponent.lasted[i, area] = 0
+            opponent.waited[i, area] += 1 if asked else 0
 
 
 @jit

@@ -21,8 +21,12 @@ from rl2grid.engines.native.entry import (
     step_one,
 )
 from rl2grid.engines.native.environments import Environments, new_environments
-from rl2grid.engines.native.hidden_state import LOAD_P, LOAD_Q, PROD_P, PROD_V, HiddenState, new_hidden_state
+from rl2grid.engines.native.hidden_state import new_hidden_state
+from rl2grid.engines.native.imagination import imagined_rows, outlook_of
+from rl2grid.engines.native.playing import Playing, playing_named, playing_scenario
 from rl2grid.engines.native.series import outages_of
+from rl2grid.engines.native.worlds import RowLayout, restore_row, save_row
+from rl2grid.engines.worlds import Home, SeriesName, World, grid_fingerprint
 from rl2grid.errors import UsageError, one_of
 from rl2grid.grids import Grid
 from rl2grid.handles import Handle
@@ -66,9 +70,13 @@ class NativeEngine:
             raise one_of("Dispatch", dispatch, DISPATCHES)
         self.grid = grid
         self.dispatch = dispatch
+        self._given_network = network
         self._network = load_network(grid) if network is None else network
+        self._opponent = opponent
         self._attacks = opponent and grid.opponent.kind != "none"
-        self._scenarios: list[Scenario | None] = [None] * n
+        self._playing: list[Playing | None] = [None] * n
+        # Behind an imagined future: planners come back to it.
+        self._true: list[Playing | None] = [None] * n
         self._use(new_environments(grid, self._network, n, self._attacks))
         self._simulated = Handle(new_environments(grid, self._network, 1, opponent=False))
 
@@ -106,7 +114,6 @@ class NativeEngine:
             outages: planned outages, int32 [outage, 3]: line, first row, row after the last; by line and row.
             draws: what the opponent does; None: nothing.
         """
-        self._scenarios[i] = scenario  # keeps the series alive, of which compiled code knows the address only
         outages = outages - np.array([0, start, start], np.int32)
         outages = outages[outages[:, 2] > 0]
         self._make_room(len(outages))
@@ -115,7 +122,8 @@ class NativeEngine:
         hidden.outage_begin[i, : len(outages)] = outages[:, 1]
         hidden.outage_end[i, : len(outages)] = outages[:, 2]
         hidden.outage_count[i] = len(outages)
-        _point_at_series(hidden, i, scenario, start)
+        self._playing[i] = self._true[i] = playing = playing_scenario(scenario, start)
+        playing.begin(hidden, i)
         if draws is not None:
             load_draws(self.environments.opponent, i, draws)
         state.step[i] = 0
@@ -159,7 +167,86 @@ class NativeEngine:
 
     def close(self) -> None:
         """Let go of the series."""
-        self._scenarios = [None] * len(self._scenarios)
+        self._playing = [None] * len(self._playing)
+        self._true = [None] * len(self._true)
+
+    def save(self, i: int) -> World:
+        """Everything of environment ``i`` at this moment.
+
+        Raises:
+            UsageError: it was not reset yet.
+        """
+        playing = self._series_of(i)
+        layout, n_outages = self._layout, int(self.environments.hidden.outage_count[i])
+        rows = layout.room(n_outages)
+        save_row(layout.table, layout.outages, n_outages, i, rows)
+        return World(self.home, rows, playing.name, nearby=playing.reference)
+
+    def restore(self, i: int, world: World) -> None:
+        """Bring environment ``i`` to where ``world`` was saved: what follows is what followed there, bit for bit.
+
+        Raises:
+            UsageError: the world is of another grid or of an engine made otherwise, or its series is not to be had.
+        """
+        if world.home is not self.home:
+            world.check_home(self.home)
+        playing = None if world.nearby is None else world.nearby()
+        if playing is None:
+            playing = playing_named(self.grid, world.series)
+        n_outages = self._layout.n_outages(world.rows)
+        self._make_room(n_outages)
+        layout = self._layout
+        restore_row(layout.table, layout.outages, n_outages, i, world.rows)
+        playing.go_on(self.environments.hidden, i)
+        self._playing[i] = playing
+        if not world.imagined:
+            self._true[i] = playing
+
+    def imagine(self, i: int, seed: int) -> World:
+        """A world that goes on from here as far as an operator may know; see ``docs/worlds.md``.
+
+        Args:
+            i: the environment, which stays where it is.
+            seed: of the opponent's draws.
+
+        Raises:
+            UsageError: there is no episode in progress.
+        """
+        playing, state = self._series_of(i), self.state
+        if state.terminated[i] or state.truncated[i]:
+            raise UsageError("Nothing can be imagined after the end of an episode: reset the environment first.")
+        rows = imagined_rows(self.grid, self._layout, self.environments.opponent, self.save(i).rows, seed)
+        series = playing.name
+        if isinstance(series, SeriesName):
+            scenario, gen_v = playing.source, self.environments.hidden.gen_v[i]
+            assert isinstance(scenario, Scenario)
+            series = outlook_of(scenario, series.start, int(state.step[i]), self._network, gen_v)
+        return World(self.home, rows, series)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> NativeEngine:
+        """An engine of its own, whose environments are where these are; grid and series are shared."""
+        rebuild, arguments = self.__reduce__()
+        copied: NativeEngine = rebuild(*arguments)
+        return copied
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        made = self.grid, len(self._playing), self.dispatch, self._opponent, self._given_network
+        return _rebuild, (*made, self._save_all())
+
+    def _save_all(self) -> list[World | None]:
+        """The worlds of all environments; None: it was not reset yet."""
+        return [None if playing is None else self.save(i) for i, playing in enumerate(self._playing)]
+
+    def _restore_all(self, worlds: list[World | None]) -> None:
+        for i, world in enumerate(worlds):
+            if world is not None:
+                self.restore(i, world)
+
+    def _series_of(self, i: int) -> Playing:
+        playing = self._playing[i]
+        if playing is None:
+            raise UsageError("The environment was not reset yet: call reset first.")
+        return playing
 
     @property
     def address(self) -> int:
@@ -177,6 +264,9 @@ class NativeEngine:
         self.environments = environments
         self.state = environments.state
         self._handles = [Handle(environments)]
+        self._layout = RowLayout(environments)
+        fingerprint = grid_fingerprint(self.grid)
+        self.home = Home("native", self.grid.id, fingerprint, self.dispatch, self._attacks, self._layout.hash)
 
     def _make_room(self, outages: int) -> None:
         """Grow the arrays to hold that many planned outages per environment."""
@@ -192,11 +282,11 @@ class NativeEngine:
 
     def _begin_simulation(self, i: int, action: StepAction, horizon: int) -> bool:
         """Play a step on the forecast up to the setting of the generators; False if they cannot be dispatched."""
-        scenario = self._scenarios[i]
-        if self.state.terminated[i] or scenario is None:
+        playing = self._playing[i]
+        if self.state.terminated[i] or playing is None:
             raise UsageError("Nothing can be simulated after a game over: reset the environment first.")
-        if scenario.load_p_forecast is None or horizon > scenario.load_p_forecast.shape[1]:
-            raise UsageError(f"Scenario {scenario.id!r} has no forecast {horizon} steps ahead.")
+        if horizon > self.environments.hidden.horizons[i]:
+            raise UsageError(f"Scenario {playing.name.scenario_id!r} has no forecast {horizon} steps ahead.")
         self._copy_row(i)
         exact, simulated, real = self.dispatch == "exact", self._simulated.address, self.address
         needed = begin_simulation_one(simulated, real, i, *_command(action), horizon, exact)
@@ -245,18 +335,10 @@ def _command(action: StepAction) -> tuple[int, int, int, F32]:
     return action.kind, action.target, action.mask, values
 
 
-def _point_at_series(hidden: HiddenState, i: int, scenario: Scenario, start: int) -> None:
-    series = ((LOAD_P, "load_p"), (LOAD_Q, "load_q"), (PROD_P, "prod_p"), (PROD_V, "prod_v"))
-    for column, name in series:
-        hidden.series[i, column] = _address(getattr(scenario, name), start)
-        hidden.forecast[i, column] = _address(getattr(scenario, f"{name}_forecast"), start)
-    hidden.horizons[i] = 0 if scenario.load_p_forecast is None else scenario.load_p_forecast.shape[1]
-
-
-def _address(array: F32 | None, row: int) -> int:
-    """Address of a row of a series, 0 if there is none."""
-    if array is None:
-        return 0
-    assert array.dtype == np.float32
-    assert array.flags.c_contiguous
-    return int(array.ctypes.data) + row * array.strides[0]
+def _rebuild(
+    grid: Grid, n: int, dispatch: str, opponent: bool, network: Network | None, worlds: list[World | None]
+) -> NativeEngine:
+    """The engine that was pickled."""
+    engine = NativeEngine(grid, n, dispatch, opponent, network)
+    engine._restore_all(worlds)
+    return engine

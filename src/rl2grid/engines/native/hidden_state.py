@@ -57,8 +57,9 @@ class HiddenState(NamedTuple):
 
     # The episode.
     series: Annotated[I64, address("4", "of the first row played; 0: none (LOAD_P, LOAD_Q, PROD_P, PROD_V)")]
-    forecast: Annotated[I64, address("4", "of the forecasts made in that row")]
+    forecast: Annotated[I64, address("4", "of the forecasts made in that row; 0: the series is what is forecast")]
     horizons: Annotated[I32, episode("", "that each row forecasts", "steps")]
+    last_row: Annotated[I32, episode("", "whose row of the series all later steps repeat", "step")]
     outage_line: Annotated[I32, episode("outage", "planned outages, by line and begin")]
     outage_begin: Annotated[I32, episode("outage", "step at which it begins")]
     outage_end: Annotated[I32, episode("outage", "first step after it")]

@@ -33,19 +33,18 @@ def _float32_at(typing_context: Any, address: Any, index: Any) -> Any:
 @jit
 def read_row(environments: Environments, i: int, step: int) -> None:
     """Read what the series says of step ``step`` of row ``i``: demand, production, voltages."""
-    hidden = environments.hidden
-    _copy(hidden.series[i, LOAD_P], step, hidden.load_p[i])
-    _copy(hidden.series[i, LOAD_Q], step, hidden.load_q[i])
-    _copy(hidden.series[i, PROD_P], step, hidden.new_p[i])
-    _read_voltages(hidden.series[i, PROD_V], step, environments, i)
+    _read_series(environments, i, environments.hidden, i, step)
 
 
 @jit
 def read_forecast(environments: Environments, i: int, source: HiddenState, row: int, step: int, horizon: int) -> None:
     """Read into row ``i`` what row ``row`` of ``source`` forecasts at ``step`` for ``horizon`` steps later.
 
-    Without forecast set-points the measured voltages are kept, as Grid2Op does.
+    Without forecast set-points the measured voltages are kept, as Grid2Op does. An imagined future is its own forecast.
     """
+    if source.forecast[row, LOAD_P] == 0:
+        _read_series(environments, i, source, row, step + horizon)
+        return
     network, hidden = environments.network, environments.hidden
     place = np.int64(step) * source.horizons[row] + horizon - 1
     _copy(source.forecast[row, LOAD_P], place, hidden.load_p[i])
@@ -57,6 +56,17 @@ def read_forecast(environments: Environments, i: int, source: HiddenState, row: 
     for gen in range(hidden.gen_v.shape[1]):
         measured = np.float32(source.gen_v[row, gen] * network.nominal_voltage[network.gen_sub[gen]])
         hidden.gen_v[i, gen] = measured / network.gen_kilovolt[gen]
+
+
+@jit
+def _read_series(environments: Environments, i: int, source: HiddenState, row: int, step: int) -> None:
+    """Read into row ``i`` what the series of row ``row`` of ``source`` says of step ``step``."""
+    hidden = environments.hidden
+    place = min(step, source.last_row[row])
+    _copy(source.series[row, LOAD_P], place, hidden.load_p[i])
+    _copy(source.series[row, LOAD_Q], place, hidden.load_q[i])
+    _copy(source.series[row, PROD_P], place, hidden.new_p[i])
+    _read_voltages(source.series[row, PROD_V], place, environments, i)
 
 
 @jit

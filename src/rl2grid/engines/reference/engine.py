@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from rl2grid.engines import DISPATCHES
+from rl2grid.engines.worlds import History, Home, SeriesName, World, grid_fingerprint, other_values
 from rl2grid.errors import UsageError, one_of
 from rl2grid.grids import Grid
 from rl2grid.mdp.actions import ActionKind, StepAction, decode_continuous, moved_elements
@@ -38,6 +39,9 @@ from rl2grid.engines.reference.chronics import ScenarioChronics
 from rl2grid.engines.reference.dispatch import ExactRedispatchSolver, redispatch_is_impossible
 from rl2grid.engines.reference.opponent import install_opponent
 
+_LAYOUT = ",".join(GridState._fields)
+"""What is saved of an environment beside its history."""
+
 
 class ReferenceEngine:
     """``n`` Grid2Op environments of one grid; see :class:`rl2grid.engines.base.Engine`."""
@@ -49,6 +53,11 @@ class ReferenceEngine:
         self.state = new_state(grid, n)
         self._simulated = new_state(grid, 1)
         self._dispatch = dispatch
+        self._attacks = opponent
+        self._plans: list[EpisodePlan | None] = [None] * n
+        self._actions: list[list[StepAction]] = [[] for _ in range(n)]
+        attacked = opponent and grid.opponent.kind != "none"
+        self._home = Home("reference", grid.id, grid_fingerprint(grid), dispatch, attacked, _LAYOUT)
         self._opponent = new_opponent_state(grid, n) if opponent and grid.opponent.kind != "none" else None
         self._environments = self._make_environments(n)
         self._do_nothing = [environment.action_space() for environment in self._environments]
@@ -57,6 +66,7 @@ class ReferenceEngine:
 
     def reset(self, i: int, plan: EpisodePlan) -> None:
         """Begin the episode ``plan`` in environment ``i``."""
+        self._plans[i], self._actions[i] = plan, []
         environment = self._environments[i]
         scenario = load_scenario(self.grid.id, plan.scenario_id)
         maintenance = maintenance_matrix(self.grid, scenario, plan)
@@ -75,6 +85,9 @@ class ReferenceEngine:
 
     def step(self, i: int, action: StepAction) -> None:
         """Play one Grid2Op step of environment ``i``."""
+        # A copy: the caller may write other values to the array.
+        values = None if action.values is None else action.values.copy()
+        self._actions[i].append(action._replace(values=values))
         state, environment = self.state, self._environments[i]
         impossible = self._is_impossible(i, action)
         observation, _, done, info = environment.step(self._played(i, action, impossible))
@@ -115,6 +128,67 @@ class ReferenceEngine:
     def grid2op_environment(self, i: int) -> Any:
         """The ``grid2op.Environment`` behind environment ``i``."""
         return self._environments[i]
+
+    def save(self, i: int) -> World:
+        """Environment ``i`` at this moment: what was observed and summed up, and how it came there.
+
+        Grid2Op has no way to bring an environment to a given state, so :meth:`restore` plays the episode again.
+        """
+        plan = self._plans[i]
+        if plan is None:
+            raise UsageError("The environment was not reset yet: call reset first.")
+        scenario = load_scenario(self.grid.id, plan.scenario_id)
+        rows = b"".join(array[i].tobytes() for array in self._saved())
+        return World(
+            self._home,
+            np.frombuffer(rows, np.uint8),
+            SeriesName(scenario.id, scenario.content_hash, plan.start),
+            History(plan, tuple(self._actions[i])),
+        )
+
+    def restore(self, i: int, world: World) -> None:
+        """Bring environment ``i`` to where ``world`` was saved, by playing its episode again: about 1 ms per grid step.
+
+        Raises:
+            UsageError: the world is of another grid or of an engine made otherwise, or its series is not to be had.
+        """
+        world.check_home(self._home)
+        history, series = world.history, world.series
+        assert history is not None
+        assert isinstance(series, SeriesName)
+        if load_scenario(self.grid.id, series.scenario_id).content_hash != series.content_hash:
+            raise other_values(self.grid.id, series)
+        self.reset(i, history.plan)
+        for action in history.actions:
+            self.step(i, action)
+        # Sums over grid steps and what a heuristic leaves are not the engine's.
+        place = 0
+        for array in self._saved():
+            row = np.frombuffer(world.rows, array.dtype, array[i].size, place)
+            array[i] = row.reshape(array.shape[1:])
+            place += row.nbytes
+
+    def imagine(self, i: int, seed: int) -> World:
+        """Not on this engine.
+
+        Raises:
+            UsageError: always.
+        """
+        raise UsageError('The reference engine cannot imagine: choose engine="native".')
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> ReferenceEngine:
+        """An engine of its own, whose environments are where these are."""
+        rebuild, arguments = self.__reduce__()
+        copied: ReferenceEngine = rebuild(*arguments)
+        return copied
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        worlds = [None if plan is None else self.save(i) for i, plan in enumerate(self._plans)]
+        return _rebuild, (self.grid, self._dispatch, self._attacks, worlds)
+
+    def _saved(self) -> list[np.ndarray[Any, Any]]:
+        """The arrays of the state that have an axis of environments."""
+        return list(self.state[GridState._fields.index("gen_p") :])
 
     def close(self) -> None:
         """Close the Grid2Op environments."""
@@ -210,6 +284,15 @@ class ReferenceEngine:
                 result.storage_p = injection.storage
             result.curtail = injection.curtailment_limit
         return result
+
+
+def _rebuild(grid: Grid, dispatch: str, opponent: bool, worlds: list[World | None]) -> ReferenceEngine:
+    """The engine that was pickled."""
+    engine = ReferenceEngine(grid, len(worlds), dispatch, opponent)
+    for i, world in enumerate(worlds):
+        if world is not None:
+            engine.restore(i, world)
+    return engine
 
 
 def _make_grid2op(grid: Grid, scenario: Any, dispatch: str) -> Any:
