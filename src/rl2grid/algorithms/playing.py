@@ -133,7 +133,7 @@ def resume_environments(envs: VectorEnv[Any, Any, Any], state: Any, expected: ND
     """Bring environments back to ``state``, where they show the observations ``expected``.
 
     Raises:
-        UsageError: the environments, played again, are not where they were.
+        UsageError: the state is of other environments, or these are not where those were.
     """
     observations, _ = envs.load_state_dict(state)  # type: ignore[attr-defined]
     if not np.array_equal(observations, expected):

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rl2grid.arrays import I64
+from rl2grid.engines.worlds import World, world_of_plain
 from rl2grid.envs.description import check_action
 from rl2grid.envs.environments import Environments, StreamPosition
 from rl2grid.envs.info import batch_info
@@ -38,6 +39,7 @@ class EngineRows(Environments, ABC, Generic[Decisions]):
         self._starts = np.zeros(n, np.int64)
         self._redraws = np.zeros(n, np.int64)
         self._earlier_steps = np.zeros(n, np.int64)  # grid steps of earlier episodes of a seed's stream
+        self._shown_effects = np.full(n, "", object)
 
     def reset(self, seeds: list[int | None], options: dict[str, Any] | None) -> Batch:
         """See :meth:`rl2grid.envs.rows.Rows.reset`."""
@@ -51,7 +53,9 @@ class EngineRows(Environments, ABC, Generic[Decisions]):
         if waiting.any():  # these rows return the ending that their reset has already played
             rows = np.flatnonzero(~waiting)
             self._pending[:] = False
+        self._note_decisions()
         self._play(rows, decisions)
+        self._note_reached()
         effects = self._effects(decisions)
         effects[waiting] = ""
         state = self.state
@@ -74,15 +78,33 @@ class EngineRows(Environments, ABC, Generic[Decisions]):
 
     def state_dict(self) -> list[dict[str, Any]]:
         """See :meth:`rl2grid.envs.rows.Rows.state_dict`."""
-        return [self.saved_row(i) for i in range(self._n) if self._positions[i] is not None]
+        return [self._world(i).to_plain() for i in range(self._n) if self._positions[i] is not None]
 
     def load_state_dict(self, rows: list[dict[str, Any]]) -> Batch:
         """See :meth:`rl2grid.envs.rows.Rows.load_state_dict`."""
-        for i, saved in enumerate(rows):
-            self.replay(i, saved)
-        effects = np.empty(self._n, object)
-        effects[:] = [self.transitions.action_effects[i] for i in range(self._n)]
-        return self._batch(effects)
+        worlds = [world_of_plain(row) for row in rows]
+        for world in worlds:  # all or none
+            self._checked_standing(world)
+        for i, world in enumerate(worlds):
+            self.restore(i, world)
+        return self._batch(self._shown_effects)
+
+    def restore_row(self, i: int, world: World) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """See :meth:`rl2grid.envs.rows.Rows.restore_row`."""
+        self.restore(i, world)
+        observation = np.zeros(self._size, np.float32)
+        self.write_observation(i, observation)
+        return observation, self.info(i)
+
+    def restore(self, i: int, world: World) -> None:
+        """Bring row ``i`` to where ``world`` was saved; see :meth:`Environments.restore`."""
+        super().restore(i, world)
+        # A copy: the array was handed out with the infos of the last step.
+        self._shown_effects = self._shown_effects.copy()
+        self._shown_effects[i] = self.transitions.action_effects[i]
+
+    def _effect(self, i: int) -> str:
+        return str(self._shown_effects[i])
 
     @abstractmethod
     def _decide(self, actions: Any) -> Decisions:
@@ -124,16 +146,13 @@ class EngineRows(Environments, ABC, Generic[Decisions]):
         self._redraws[i] = plan.redraws
 
     def _decided(self, actions: Any) -> Decisions:
-        """The actions of all rows, checked, and noted in the rows' positions."""
-        positions = [self._position(i) for i in range(self._n)]
+        """The actions of all rows, checked."""
+        for i in range(self._n):
+            self._position(i)
         given = len(actions) if hasattr(actions, "__len__") else 1
         if given != self._n:
             raise UsageError(f"{given} actions were given for {self._n} environments: give one each.")
-        decisions = self._decide(actions)
-        history = np.array(actions, np.float32) if self._catalogue is None else np.asarray(actions).tolist()
-        for position, action in zip(positions, history, strict=True):
-            position.actions.append(action)
-        return decisions
+        return self._decide(actions)
 
     def _check(self, actions: Any) -> None:
         """Say what is wrong with the first wrong action."""
@@ -147,6 +166,7 @@ class EngineRows(Environments, ABC, Generic[Decisions]):
         return {"final_obs": observation, "final_info": self.info(i)}
 
     def _batch(self, effects: NDArray[np.object_]) -> Batch:
+        self._shown_effects = effects
         infos = {
             "scenario": self._scenarios.copy(),
             "start": self._starts.copy(),

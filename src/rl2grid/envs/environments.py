@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from datetime import datetime
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rl2grid.engines.action_effects import clipping, cooldown_left, refusal
 from rl2grid.engines.base import Engine
-from rl2grid.engines.transition import Transitions
+from rl2grid.engines.transition import Listener, Transitions
+from rl2grid.engines.worlds import Standing, Trail, World
 from rl2grid.envs.description import action_number
 from rl2grid.envs.info import episode_info
 from rl2grid.envs.options import TaskOptions
@@ -40,15 +42,13 @@ if TYPE_CHECKING:
 _RESET_OPTIONS = ("scenario", "start")
 
 
-@dataclass
+@dataclass(frozen=True)
 class StreamPosition:
-    """Where one environment is in its stream of episodes; enough to play it again."""
+    """Where one environment is in its stream of episodes."""
 
     seed: int
     number: int
     options: dict[str, Any] = field(default_factory=dict)
-    actions: list[Any] = field(default_factory=list)
-    """The agent's actions since the reset."""
     grid_steps: int = 0
     """Grid steps played in earlier episodes of the seed's stream."""
 
@@ -106,6 +106,12 @@ class Environments:
         self._positions: list[StreamPosition | None] = [None] * n
         self._pending = np.zeros(n, np.bool_)  # the episode ended inside reset, its ending is still to be returned
         self._solver: WhatIf | None = None
+        self.imagined = np.zeros(n, np.bool_)
+        """bool [n], which rows play an imagined world."""
+        self.foresight = np.zeros(n, np.int64)
+        """int64 [n], decisions of the running episode taken where its truth had been seen before."""
+        self._trails: dict[int, Trail] = {}  # of rows of which a true world was saved or restored; others need none
+        self._keywords = tuple((each.name, _in_words(getattr(options, each.name))) for each in fields(options))
 
     @property
     def state(self) -> GridState:
@@ -129,16 +135,16 @@ class Environments:
         Raises:
             UsageError: the action has the wrong shape or value, or the episode is over.
         """
-        position = self._position(i)
+        self._position(i)
         played = self._step_action(action)
         if self._pending[i]:
-            position.actions.append(action)
             self._pending[i] = False
             return
         if self.is_over(i):
             raise UsageError("The episode is over: call reset before the next step.")
+        self._note_decisions()
         self.transitions.play(i, played)
-        position.actions.append(action)
+        self._note_reached()
 
     def is_over(self, i: int) -> bool:
         """The episode of row ``i`` was lost or completed."""
@@ -241,24 +247,105 @@ class Environments:
             raise UsageError('A what-if is answered by the native engine only: choose engine="native".')
         return cast("NativeEngine", self.engine)
 
-    def saved_row(self, i: int) -> dict[str, Any]:
-        """Everything needed to bring row ``i`` back to where it is, as plain values."""
-        position = self._position(i)
-        return {
-            "seed": position.seed,
-            "number": position.number,
-            "options": dict(position.options),
-            "actions": [np.asarray(action).tolist() for action in position.actions],
-            "grid_steps": position.grid_steps,
-        }
+    def save(self, i: int) -> World:
+        """Everything of row ``i`` at this moment.
 
-    def replay(self, i: int, saved: dict[str, Any]) -> None:
-        """Bring row ``i`` to where a row was when it was saved, by playing its episode again."""
-        previous = StreamPosition(saved["seed"], saved["number"] - 1, grid_steps=saved["grid_steps"])
-        self._positions[i], self._plans[i] = previous, None
-        self.begin(i, None, saved["options"])
-        for action in saved["actions"]:
-            self.play(i, action)
+        Raises:
+            UsageError: it was not reset yet.
+        """
+        self._position(i)
+        if not self.imagined[i] and i not in self._trails:
+            self._trails[i] = Trail(int(self.state.step[i]))
+        return self._world(i)
+
+    def restore(self, i: int, world: World) -> None:
+        """Bring row ``i`` to where ``world`` was saved.
+
+        Raises:
+            UsageError: the world is of another task, of other keywords or of an engine alone, or its series is not to
+                be had.
+        """
+        standing = self._checked_standing(world)
+        self.engine.restore(i, world)
+        options = dict(standing.reset_options)
+        self._take(i, StreamPosition(standing.seed, standing.number, options, standing.earlier_steps), standing.plan)
+        self.transitions.action_effects[i] = standing.effect
+        self._pending[i], self.imagined[i], self.foresight[i] = standing.pending, world.imagined, standing.foresight
+        if standing.trail is not None:
+            self._trails[i] = standing.trail
+
+    def imagine(self, i: int, seed: int) -> World:
+        """A world that goes on from row ``i`` as far as an operator may know; see ``docs/worlds.md``.
+
+        Raises:
+            UsageError: the seed is negative, there is no episode in progress, or the engine cannot imagine.
+        """
+        if not isinstance(seed, int | np.integer) or seed < 0:
+            raise UsageError(f"seed={seed!r} is not allowed: give an integer, not negative.")
+        self._position(i)
+        seed = int(seed)
+        standing = self._standing(i)
+        # Nobody can know the seed of the true episode, from which attacks follow. Later episodes are another stream's.
+        plan = replace(standing.plan, seed=seed, number=0)
+        return self.engine.imagine(i, seed).at(replace(standing, seed=seed, number=0, plan=plan, trail=None))
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        """Environments of their own, which are where these are."""
+        rebuild, (kind, arguments, worlds, listeners) = self.__reduce__()
+        return cast("Self", rebuild(kind, arguments, worlds, copy.deepcopy(listeners, memo)))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        worlds = [None if position is None else self.save(i) for i, position in enumerate(self._positions)]
+        return _rebuild, (type(self), self._arguments(), worlds, self.transitions.listeners)
+
+    def _arguments(self) -> tuple[Any, ...]:
+        """What these environments were made with."""
+        return self.task, self.options, len(self._positions)
+
+    def _world(self, i: int) -> World:
+        return self.engine.save(i).at(self._standing(i))
+
+    def _standing(self, i: int) -> Standing:
+        plan, position = self._plans[i], self._position(i)
+        assert plan is not None
+        return Standing(
+            task=self.task.id,
+            options=self._keywords,
+            seed=position.seed,
+            number=position.number,
+            reset_options=tuple(position.options.items()),
+            earlier_steps=position.grid_steps,
+            pending=bool(self._pending[i]),
+            plan=plan,
+            effect=self._effect(i),
+            foresight=int(self.foresight[i]),
+            trail=self._trails.get(i),
+        )
+
+    def _effect(self, i: int) -> str:
+        """What was refused or clipped of the last action in row ``i``."""
+        return self.transitions.action_effects[i]
+
+    def _checked_standing(self, world: World) -> Standing:
+        standing = world.standing
+        if standing is None:
+            raise UsageError("This world is of an engine alone: restore one that an environment has saved.")
+        if standing.task != self.task.id:
+            raise UsageError(f"This world is of {standing.task}: it cannot be restored in {self.task.id}.")
+        for (name, theirs), (_, mine) in zip(standing.options, self._keywords, strict=True):
+            if theirs != mine:
+                raise UsageError(f"This world is of an environment with {name}={theirs}, this one has {name}={mine}.")
+        return standing
+
+    def _note_decisions(self) -> None:
+        """Before a step: count those that are taken where the truth was seen before."""
+        for i, trail in self._trails.items():
+            self.foresight[i] += self.state.step[i] < trail.furthest and not self.is_over(i)
+
+    def _note_reached(self) -> None:
+        """After a step: note how far the truth has been seen."""
+        for i, trail in self._trails.items():
+            trail.furthest = max(trail.furthest, int(self.state.step[i]))
 
     def close(self) -> None:
         self.engine.close()
@@ -272,6 +359,8 @@ class Environments:
     def _take(self, i: int, position: StreamPosition, plan: EpisodePlan) -> None:
         """Move row ``i`` to an episode of its stream."""
         self._positions[i], self._plans[i] = position, plan
+        self.imagined[i], self.foresight[i] = False, 0
+        self._trails.pop(i, None)
 
     def _next_position(self, i: int, seed: int | None, options: dict[str, Any] | None) -> StreamPosition:
         options = options or {}
@@ -280,9 +369,8 @@ class Environments:
                 raise UsageError(f"Reset option {name!r} does not exist: choose from {', '.join(_RESET_OPTIONS)}.")
         previous = self._positions[i]
         if seed is None and previous is not None:
-            # The rows of a restored position have not been played: see replay.
-            played = previous.grid_steps + (int(self.state.step[i]) if self._plans[i] is not None else 0)
-            return StreamPosition(previous.seed, previous.number + 1, options, grid_steps=played)
+            played = previous.grid_steps + int(self.state.step[i])
+            return StreamPosition(previous.seed, previous.number + 1, options, played)
         if seed is None:
             seed = int(np.random.SeedSequence().generate_state(1, np.uint64)[0] >> np.uint64(1))
         return StreamPosition(int(seed), 0, options)
@@ -308,6 +396,22 @@ class Environments:
         if self._catalogue is None:
             return StepAction(int(ActionKind.INJECTION), values=validate_continuous(self.grid, action))
         return self._catalogue[action_number(action, len(self._catalogue))]
+
+
+def _rebuild(
+    kind: type[Environments], arguments: tuple[Any, ...], worlds: list[World | None], listeners: list[Listener]
+) -> Environments:
+    """The environments that were copied or pickled."""
+    environments = kind(*arguments)
+    environments.transitions.listeners.extend(listeners)
+    for i, world in enumerate(worlds):
+        if world is not None:
+            environments.restore(i, world)
+    return environments
+
+
+def _in_words(value: Any) -> str:
+    return f"{value.__module__}.{value.__qualname__}" if callable(value) else repr(value)
 
 
 def _start_info(plan: EpisodePlan) -> dict[str, Any]:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rl2grid.engines.transition import Listener
+from rl2grid.engines.worlds import World
 from rl2grid.envs.description import TaskDescription, single_spaces
 from rl2grid.envs.environments import Environments, SimulationResult
 from rl2grid.envs.options import keyword_names, options_of, shows_options
@@ -192,6 +193,54 @@ class PowerGridEnv(gymnasium.Env[NDArray[np.float32], Any], TaskDescription):
             UsageError: no episode in progress, or the reference engine.
         """
         return self._environments.n_minus_1_score(0)
+
+    @property
+    def imagined(self) -> bool:
+        """Whether an imagined world is played."""
+        return bool(self._environments.imagined[0])
+
+    @property
+    def foresight(self) -> int:
+        """Decisions of the running episode taken where its truth had been seen before; see ``docs/worlds.md``."""
+        return int(self._environments.foresight[0])
+
+    def save(self) -> World:
+        """Everything of the environment at this moment; see ``docs/worlds.md``.
+
+        Raises:
+            UsageError: the environment was not reset yet.
+        """
+        return self._environments.save(0)
+
+    def restore(self, world: World) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Go on from where ``world`` was saved: what follows is what followed there, bit for bit.
+
+        Returns:
+            The observation, float32 [feature], and the info of that moment.
+
+        Raises:
+            UsageError: the world is of another task, of other keywords or of an engine alone, or its series is not to
+                be had.
+        """
+        self._environments.restore(0, world)
+        self._last_action = None
+        return self._observation(), self._environments.info(0)
+
+    def imagine(self, seed: int) -> World:
+        """A world that goes on from here as far as an operator may know; see ``docs/worlds.md``.
+
+        The environment stays where it is; ``restore`` the world to play it, in this environment or in another one.
+
+        Args:
+            seed: of the opponent's draws.
+
+        Raises:
+            UsageError: there is no episode in progress, or the seed is negative; or the reference engine plays.
+        """
+        return self._environments.imagine(0, seed)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_renderer": None}  # made again when it is needed
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Which discrete actions are legal now, bool [action].

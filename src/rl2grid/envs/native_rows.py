@@ -27,6 +27,9 @@ class NativeRows(EngineRows[Commands]):
         self._num_threads = num_threads or os.cpu_count() or 1
         self._buffers = [np.zeros((n, self._size), np.float32) for _ in range(2)]
 
+    def _arguments(self) -> tuple[Any, ...]:
+        return *super()._arguments(), self._num_threads
+
     def _decide(self, actions: Any) -> Commands:
         return self._continuous(actions) if self._catalogue is None else self._discrete(actions)
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rl2grid.engines.worlds import World
 from rl2grid.envs.description import check_action
 from rl2grid.envs.options import TaskOptions
 from rl2grid.envs.rows import Batch
@@ -20,7 +21,7 @@ class RemoteRows:
     """:class:`~rl2grid.envs.rows.Rows` of which every process plays a part, all processes at once."""
 
     def __init__(self, task: Task, options: TaskOptions, n: int, num_workers: int) -> None:
-        self._task, self._n = task, n
+        self._task, self._options, self._n = task, options, n
         bounds = np.linspace(0, n, num_workers + 1).astype(int).tolist()
         self._parts = [slice(first, last) for first, last in itertools.pairwise(bounds)]
         self._workers = [Worker(task, options, part.stop - part.start) for part in self._parts]
@@ -47,6 +48,24 @@ class RemoteRows:
     def action_masks(self) -> NDArray[np.bool_]:
         """See :meth:`rl2grid.envs.rows.Rows.action_masks`."""
         return np.concatenate(self._ask("action_masks", [() for _ in self._parts]))
+
+    def save(self, i: int) -> World:
+        """See :meth:`rl2grid.envs.rows.Rows.save`."""
+        world: World = self._ask_one(i, "save")
+        return world
+
+    def restore_row(self, i: int, world: World) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """See :meth:`rl2grid.envs.rows.Rows.restore_row`."""
+        observation, info = self._ask_one(i, "restore_row", world)
+        return observation, info
+
+    def imagine(self, i: int, seed: int) -> World:
+        """See :meth:`rl2grid.envs.rows.Rows.imagine`."""
+        world: World = self._ask_one(i, "imagine", seed)
+        return world
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _rebuild, (self._task, self._options, self._n, len(self._workers), self.state_dict())
 
     def state_dict(self) -> list[dict[str, Any]]:
         """See :meth:`rl2grid.envs.rows.Rows.state_dict`."""
@@ -75,6 +94,13 @@ class RemoteRows:
             raise failure
         return answers
 
+    def _ask_one(self, i: int, method: str, *arguments: Any) -> Any:
+        """Call ``method`` of the worker that plays row ``i``."""
+        place = next(k for k, part in enumerate(self._parts) if part.start <= i < part.stop)
+        worker = self._workers[place]
+        worker.send(method, i - self._parts[place].start, *arguments)
+        return worker.receive()
+
     def _together(self, batches: list[Batch]) -> Batch:
         """The batches of all workers as that of all rows."""
         endings = {
@@ -90,6 +116,14 @@ class RemoteRows:
             _joined([batch.infos for batch in batches]),
             endings,
         )
+
+
+def _rebuild(task: Task, options: TaskOptions, n: int, num_workers: int, rows: list[dict[str, Any]]) -> RemoteRows:
+    """The rows that were copied or pickled, in processes of their own."""
+    remote = RemoteRows(task, options, n, num_workers)
+    if rows:
+        remote.load_state_dict(rows)
+    return remote
 
 
 def _joined(infos: list[dict[str, Any]]) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from rl2grid.engines.worlds import World
 from rl2grid.envs.options import TaskOptions
 from rl2grid.envs.tasks import Task
 from rl2grid.errors import UsageError
@@ -68,8 +69,30 @@ class Rows(Protocol):
             UsageError: the task has continuous actions.
         """
 
+    def save(self, i: int) -> World:
+        """Everything of row ``i`` at this moment.
+
+        Raises:
+            UsageError: it was not reset yet.
+        """
+
+    def restore_row(self, i: int, world: World) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Bring row ``i`` to where ``world`` was saved; the observation [feature] and the info are those of then.
+
+        Raises:
+            UsageError: the world is of another task, of other keywords or of an engine alone, or its series is not to
+                be had.
+        """
+
+    def imagine(self, i: int, seed: int) -> World:
+        """A world that goes on from row ``i`` as far as an operator may know.
+
+        Raises:
+            UsageError: the seed is negative, there is no episode in progress, or the engine cannot imagine.
+        """
+
     def state_dict(self) -> list[dict[str, Any]]:
-        """By row, all that is needed to bring it back to where it is, as plain values."""
+        """The worlds of all rows, as plain values."""
 
     def load_state_dict(self, rows: list[dict[str, Any]]) -> Batch:
         """Bring every row to where it was saved; the observations and infos are those of then."""

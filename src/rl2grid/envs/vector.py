@@ -10,6 +10,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from rl2grid.engines.worlds import World
 from rl2grid.envs.description import TaskDescription, single_spaces
 from rl2grid.envs.options import keyword_names, options_of, shows_options
 from rl2grid.envs.rows import Batch, make_rows
@@ -91,15 +92,48 @@ class PowerGridVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], Any, ND
         """Which discrete actions are legal now, bool [environment, action]."""
         return self._rows.action_masks()
 
+    def save(self, i: int) -> World:
+        """Everything of environment ``i`` at this moment; see ``docs/worlds.md``.
+
+        Raises:
+            UsageError: there is no such environment, or it was not reset yet.
+        """
+        return self._rows.save(self._row(i))
+
+    def restore(self, i: int, world: World) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Bring environment ``i`` to where ``world`` was saved: what follows is what followed there, bit for bit.
+
+        Returns:
+            Its observation, float32 [feature], and its info at that moment.
+
+        Raises:
+            UsageError: there is no such environment, the world is of another task, of other keywords or of an engine
+                alone, or its series is not to be had.
+        """
+        return self._rows.restore_row(self._row(i), world)
+
+    def imagine(self, i: int, seed: int) -> World:
+        """A world that goes on from environment ``i`` as far as an operator may know; see ``docs/worlds.md``.
+
+        Args:
+            i: the environment, which stays where it is.
+            seed: of the opponent's draws.
+
+        Raises:
+            UsageError: there is no such environment or no episode in progress, or the seed is negative; or the
+                reference engine plays.
+        """
+        return self._rows.imagine(self._row(i), seed)
+
     def state_dict(self) -> dict[str, Any]:
-        """Where every environment is, as plain values: seed, episode number, actions of the episode so far."""
+        """Where every environment is: the plain forms of their worlds."""
         return {"rows": self._rows.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Bring every environment to where :meth:`state_dict` found it, by playing its episode again.
+        """Bring every environment to where :meth:`state_dict` found it; observations and infos are those of then.
 
-        An episode is a pure function of its seed, number and actions; the observations returned are
-        therefore the very ones of then.
+        Raises:
+            UsageError: it is of other environments than these.
         """
         rows = state["rows"]
         if len(rows) != self.num_envs:
@@ -109,6 +143,11 @@ class PowerGridVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], Any, ND
     def close_extras(self, **kwargs: Any) -> None:
         """Free the simulators and end the workers."""
         self._rows.close()
+
+    def _row(self, i: int) -> int:
+        if not isinstance(i, int | np.integer) or not 0 <= i < self.num_envs:
+            raise UsageError(f"Environment {i!r} does not exist: give a number from 0 to {self.num_envs - 1}.")
+        return int(i)
 
     def _present(self, batch: Batch) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """Observations and infos as Gymnasium wants them."""
