@@ -27,6 +27,8 @@ N_LINES = 3
 class FakeGrid(gymnasium.Env[Any, Any]):
     """See the module; ``log`` names a file that notes every reset, ``fail_on`` a scenario that raises."""
 
+    imagined, foresight = False, 0
+
     def __init__(
         self,
         *,

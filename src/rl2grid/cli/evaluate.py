@@ -38,6 +38,8 @@ def run(options: argparse.Namespace) -> int:
         **chosen,
     )
     Console().print(rich_table([result.summary], title=f"{task.id}, {options.split} scenarios"))
+    if result.foresight:
+        print("The agent stepped saved true worlds: with this foresight it is not ranked with others.")
     print(f"{len(result.episodes)} episodes in {output / 'episodes.csv'}.")
     return 0
 

@@ -10,6 +10,7 @@ from typing import Any
 import gymnasium
 
 from rl2grid.agents.agent import Action, Agent, Info, RandomizedAgent, no_intervention
+from rl2grid.errors import UsageError
 from rl2grid.evaluation.collapse import COMPLETED, collapse, overloaded_lines
 from rl2grid.mdp.termination import GameOver
 from rl2grid.records.episodes import Episode
@@ -45,7 +46,8 @@ def play_episode(
         What happened, without the labels of an evaluation.
 
     Raises:
-        UsageError: the scenario is not in the split of ``env``, or leaves nothing to play after ``start``.
+        UsageError: the scenario is not in the split of ``env``, or leaves nothing to play after ``start``; or the agent
+            left ``env`` in an imagined world.
     """
     began = time.perf_counter()
     if isinstance(agent, RandomizedAgent):
@@ -56,7 +58,8 @@ def play_episode(
     totals: dict[str, Any] = dict.fromkeys(_TOTALS, 0.0)
     decisions = illegal = ambiguous = 0
     over = False
-    state = env.unwrapped.state  # type: ignore[attr-defined]
+    played: Any = env.unwrapped
+    state = played.state
     while not over:
         # The agent is only asked where the heuristic is not at ease, so that a game over in a later step of the
         # transition, or inside the reset, comes from a state without overloads.
@@ -66,6 +69,10 @@ def play_episode(
         else:
             action = agent.act(observation, info)
             decisions += 1
+            if played.imagined:
+                raise UsageError(
+                    f"{agent.name} left the environment in an imagined world: restore the true one before acting."
+                )
             if on_decision is not None:
                 on_decision(action, info)
         observation, reward, terminated, truncated, info = env.step(action)
@@ -89,6 +96,7 @@ def play_episode(
         score_topology=float(info["scores"]["topology"]),
         illegal=illegal,
         ambiguous=ambiguous,
+        foresight=played.foresight,
         wall_time_s=round(time.perf_counter() - began, 4),
         last_overloads=ending.last_overloads,
         last_outages=ending.last_outages,

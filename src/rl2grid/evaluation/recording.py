@@ -44,6 +44,8 @@ class _Recorder:
 
     def hear(self, state: GridState, row: int) -> None:
         """Keep a grid step; that of a game over has no flows to show, and is kept only if nothing else was played."""
+        if self._env.imagined:  # what an agent thinks of is not what happens
+            return
         if state.terminated[row] and self.columns["rho"]:
             return
         for name in _OBSERVED:

@@ -76,12 +76,15 @@ def facts_of(episode: Episode) -> dict[str, Any]:
     return {column.name: getattr(episode, column.name) for column in FACTS}
 
 
-def episode_hash(facts: Mapping[str, Any]) -> str:
+def episode_hash(facts: Mapping[str, Any], foresight: int = 0) -> str:
     """Short hash of what happened in an episode, to the last bit of every number.
 
-    The sums and means over its grid steps are among the facts, so that any difference on the way shows.
+    The sums and means over its grid steps are among the facts, so that any difference on the way shows. Foresight counts
+    where there is some.
     """
     values = [float(facts[name]) if kind is float else facts[name] for name, kind, *_ in FACTS]
+    if foresight:
+        values.append(foresight)
     return hashlib.sha256(json.dumps(values).encode()).hexdigest()[:16]
 
 
@@ -147,8 +150,9 @@ def _parse(path: Path, contents: Mapping[str, Any]) -> Entry:
 
 
 def _stored(played: PlayedActions) -> dict[str, Any]:
-    facts = facts_of(played.episode)
-    return {**facts, "hash": episode_hash(facts), **_packed(played.actions)}
+    facts, foresight = facts_of(played.episode), played.episode.foresight
+    known = {"foresight": foresight} if foresight else {}
+    return {**facts, **known, "hash": episode_hash(facts, foresight), **_packed(played.actions)}
 
 
 def _episode(path: Path, stored: Mapping[str, Any]) -> PlayedActions:
@@ -157,8 +161,11 @@ def _episode(path: Path, stored: Mapping[str, Any]) -> PlayedActions:
         value, allowed = facts[column.name], _ALLOWED[column.type]
         if not isinstance(value, allowed) or (isinstance(value, bool) and bool not in allowed):
             raise UsageError(f"{path} is a damaged entry of a leaderboard: {column.name} is {value!r}.")
-    played = PlayedActions(Episode(**facts, wall_time_s=0.0), _unpacked(stored))
-    if episode_hash(facts) != stored["hash"]:
+    foresight = stored.get("foresight", 0)
+    if type(foresight) is not int or foresight < 0:
+        raise UsageError(f"{path} is a damaged entry of a leaderboard: foresight is {foresight!r}.")
+    played = PlayedActions(Episode(**facts, wall_time_s=0.0, foresight=foresight), _unpacked(stored))
+    if episode_hash(facts, foresight) != stored["hash"]:
         raise UsageError(f"{path} was changed: the episode {played.name} does not have the hash {stored['hash']!r}.")
     if len(played.actions) != played.episode.decisions:
         raise UsageError(

@@ -27,6 +27,8 @@ class Origin(StrEnum):
     """The evaluation that the episode is part of: equal in all its rows; empty outside of one."""
     EPISODE = "episode"
     """The environment and the actions alone: who plays the actions again finds the same, to the last bit."""
+    AGENT = "agent"
+    """What the agent did beside its actions: who plays these again cannot tell."""
     CLOCK = "clock"
     """Nothing that a repetition reproduces."""
 
@@ -90,6 +92,14 @@ class Episode:
     score_topology: float = _fact("its topology score")
     illegal: int = _fact("actions of the agent that broke a rule")
     ambiguous: int = _fact("actions of the agent that contradicted themselves")
+    foresight: int = field(
+        default=0,
+        metadata={
+            "meaning": "decisions taken where the true future had been seen, by stepping a saved true world",
+            "unit": "",
+            "origin": Origin.AGENT,
+        },
+    )
     wall_time_s: float = _fact("time that the episode took", "s", Origin.CLOCK)
     engine: str = _label("`native` or `reference`")
     scenario_pack_hash: str = _label("of the series")

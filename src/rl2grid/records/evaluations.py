@@ -37,6 +37,11 @@ class Evaluation:
         """Aggregates of the episodes."""
         return summarise(self.episodes)
 
+    @property
+    def foresight(self) -> bool:
+        """Whether the agent knew in some episode what no operator knows: the true future."""
+        return any(episode.foresight for episode in self.episodes)
+
 
 def identity_hash(identity: Mapping[str, Any]) -> str:
     """Short hash of an identity, whatever the order of its entries."""
@@ -112,7 +117,8 @@ def check_comparable(results: Sequence[Evaluation]) -> None:
     Agents and heuristics may differ, the question asked of them may not.
 
     Raises:
-        UsageError: no results, or results of different tasks, scenarios, engines or versions.
+        UsageError: no results, or results of different tasks, scenarios, engines or versions, or of agents that know
+            the future and others.
     """
     if not results:
         raise UsageError("There are no results: give at least one evaluation.")
@@ -125,6 +131,12 @@ def check_comparable(results: Sequence[Evaluation]) -> None:
                     f"Results of different {key} do not belong into one table: "
                     f"{first.summary.agent} has {mine!r}, {other.summary.agent} has {theirs!r}."
                 )
+        if first.foresight != other.foresight:
+            knowing, unaware = (first, other) if first.foresight else (other, first)
+            raise UsageError(
+                f"Results with and without foresight do not belong into one table: {knowing.summary.agent} stepped "
+                f"saved true worlds, which know the future, {unaware.summary.agent} did not."
+            )
         if _played(first) != _played(other):
             raise UsageError(
                 f"Results of different scenarios or seeds do not belong into one table: {first.summary.agent} played "

@@ -48,7 +48,8 @@ class Method:
     @property
     def label(self) -> str:
         """What tables and figures call it."""
-        return method_label(self.first)
+        known = any(result.foresight for result in self.evaluations)
+        return f"{method_label(self.first)} (with foresight)" if known else method_label(self.first)
 
     @property
     def is_trained(self) -> bool:
