@@ -35,14 +35,16 @@ import numpy as np
 
 import rl2grid  # noqa: F401 - registers the tasks
 from rl2grid.engines.native.engine import NativeEngine
-from rl2grid.engines.native.transitions import Commands, NativeTransitions
+from rl2grid.engines.native.transitions import Commands, NativeTransitions, commands_of
 from rl2grid.engines.reference.extract import make_environment
 from rl2grid.grids import Grid, load_grid
 from rl2grid.mdp.actions import (
+    DO_NOTHING,
     ActionKind,
     continuous_layout,
     decode_continuous,
     full_catalogue,
+    inject,
     moved_elements,
 )
 from rl2grid.mdp.features import observation_size, physical_scale
@@ -83,17 +85,15 @@ class Ours:
     def actions(self) -> Commands:
         """One action per environment."""
         n = len(self.rows)
-        zeros, values = np.zeros(n, np.int64), np.zeros((n, 0), np.float32)
         if self.play == "nothing":
-            return Commands(zeros, zeros, zeros, values)
+            return commands_of(self.grid, [DO_NOTHING] * n)
         if self.play == "topology":
             catalogue = full_catalogue(self.grid)
             chosen = self.generator.integers(len(catalogue), size=n)
-            parts = (catalogue.kind, catalogue.target, catalogue.mask)
-            return Commands(*(part[chosen].astype(np.int64) for part in parts), values)
+            return commands_of(self.grid, [catalogue[k] for k in chosen.tolist()])
         size = continuous_layout(self.grid).size
         values = self.generator.uniform(-1, 1, (n, size)).astype(np.float32)
-        return Commands(np.full(n, int(ActionKind.INJECTION)), zeros, zeros, values)
+        return commands_of(self.grid, [inject(row) for row in values])
 
     def microseconds(self, steps: int) -> float:
         """Mean duration of a step of one environment."""
@@ -152,12 +152,13 @@ class Grid2Op:
             catalogue = full_catalogue(self.grid)
             chosen = catalogue[int(self.generator.integers(len(catalogue)))]
             action = space()
-            if chosen.kind == ActionKind.MOVE:
-                moved = np.zeros(self.grid.dim_topo, np.bool_)
-                moved[moved_elements(self.grid, chosen.target, chosen.mask)] = True
-                action.change_bus = moved
-            elif chosen.kind == ActionKind.SWITCH:
-                action.line_change_status = [chosen.target]
+            for kind, target, mask in chosen.changes:
+                if kind == ActionKind.MOVE:
+                    moved = np.zeros(self.grid.dim_topo, np.bool_)
+                    moved[moved_elements(self.grid, target, mask)] = True
+                    action.change_bus = moved
+                elif kind == ActionKind.SWITCH:
+                    action.line_change_status = [target]
             return action
         size = continuous_layout(self.grid).size
         asked = decode_continuous(self.grid, self.generator.uniform(-1, 1, size).astype(np.float32))

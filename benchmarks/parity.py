@@ -40,7 +40,7 @@ from rl2grid.engines.reference.engine import ReferenceEngine
 from rl2grid.envs.description import single_spaces
 from rl2grid.envs.tasks import find_task
 from rl2grid.grids import GRID_IDS, Grid, load_grid
-from rl2grid.mdp.actions import ActionKind, StepAction, legal_actions, level_catalogue
+from rl2grid.mdp.actions import StepAction, inject, legal_actions, level_catalogue
 from rl2grid.mdp.features import observation_size, observation_writer, physical_scale
 from rl2grid.mdp.state import GridState
 from rl2grid.records.files import write_text
@@ -113,14 +113,15 @@ class TrainedProbe:
         self._observation -= self._shift
         self._observation /= self._scale
         if self._catalogue is None:
-            return StepAction(int(ActionKind.INJECTION), values=self._agent.act(self._observation, {}))
+            return inject(self._agent.act(self._observation, {}))
         legal_actions(state, i, self._catalogue.kind, self._catalogue.target, self._masks)
         return self._catalogue[self._agent.act(self._observation, {})]
 
 
 def cells_of(grids: Iterable[str]) -> list[Cell]:
-    """Everything to be compared; topology actions meet the dispatch only in the mixed kind."""
-    dispatches = {"topology": ("exact",), "continuous": ("exact", "grid2op"), "mixed": ("exact", "grid2op")}
+    """Everything to be compared; topology actions alone do not meet the dispatch."""
+    both = ("exact", "grid2op")
+    dispatches = {"topology": ("exact",), "continuous": both, "mixed": both, "joint": both}
     return [
         Cell(grid, kind, dispatch, policy)
         for grid in grids

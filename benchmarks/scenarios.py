@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 from rl2grid.arrays import F64
 from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.engines.native.entry import reset_one, step_one
+from rl2grid.engines.native.orders import write_order
 from rl2grid.engines.native.series import outages_of
 from rl2grid.grids import GRID_IDS, Grid, load_grid
-from rl2grid.mdp.actions import ActionKind
+from rl2grid.mdp.actions import DO_NOTHING
 from rl2grid.mdp.opponents import draw_opponent
 from rl2grid.scenarios.bundled import bundled_folders
 from rl2grid.scenarios.generator import generate_month
@@ -389,10 +390,10 @@ def survive(engine: NativeEngine, grid: Grid, seed: int, month: int) -> int:
         draws = draw_opponent(grid, Stream(seed, month, Purpose.OPPONENT), scenario.n_steps)
     engine.begin(0, scenario, 0, scenario.n_steps, outages_of(outages), draws)
     reset_one(engine.address, 0)
-    nothing = np.zeros(0, np.float32)
+    write_order(engine.environments.orders, 0, DO_NOTHING)
     steps = 0
     while not engine.state.terminated[0] and steps < scenario.n_steps:
-        step_one(engine.address, 0, int(ActionKind.NOTHING), 0, 0, nothing)
+        step_one(engine.address, 0)
         steps += not engine.state.terminated[0]
     return steps
 

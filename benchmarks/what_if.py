@@ -107,11 +107,11 @@ def topologies_after(grid: Grid, snapshot: Snapshot, catalogue: ActionCatalogue,
     found = []
     for action in (catalogue[int(k)] for k in ids):
         topo_vect = snapshot.topo_vect.copy()
-        if action.kind == ActionKind.MOVE:
-            topo_vect[moved_elements(grid, action.target, action.mask)] = 2
-        elif action.kind == ActionKind.SWITCH:
-            line = action.target
-            topo_vect[[grid.line_or_pos_topo_vect[line], grid.line_ex_pos_topo_vect[line]]] = -1
+        for kind, target, mask in action.changes:
+            if kind == ActionKind.MOVE:
+                topo_vect[moved_elements(grid, target, mask)] = 2
+            elif kind == ActionKind.SWITCH:
+                topo_vect[[grid.line_or_pos_topo_vect[target], grid.line_ex_pos_topo_vect[target]]] = -1
         found.append(topo_vect)
     return found
 

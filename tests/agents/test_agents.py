@@ -14,7 +14,7 @@ from rl2grid.agents.random_agent import RandomAgent
 from rl2grid.agents.recovery import Recovery
 from rl2grid.errors import UsageError
 from rl2grid.grids import load_grid
-from rl2grid.mdp.actions import ActionKind, full_catalogue, level_ids
+from rl2grid.mdp.actions import ActionKind, full_catalogue, level_ids, move, switch
 from rl2grid.mdp.state import new_state
 
 DISCRETE = gymnasium.spaces.Discrete(5)
@@ -118,8 +118,7 @@ def test_recovery_reconnects_the_first_open_line():
     calm = Grid14()
     calm.state.line_status[0, [7, 4]] = False
     calm.state.time_before_cooldown_line[0, 4] = 2
-    action = calm.actions[calm.act()]
-    assert (action.kind, action.target) == (ActionKind.SWITCH, 7)
+    assert calm.actions[calm.act()] == switch(7)
 
 
 def test_recovery_moves_exactly_what_is_on_the_second_busbar():
@@ -127,9 +126,7 @@ def test_recovery_moves_exactly_what_is_on_the_second_busbar():
     sub = int(np.argmax(calm.env.grid.sub_info))
     first, size = int(calm.env.grid.sub_first_element[sub]), int(calm.env.grid.sub_info[sub])
     calm.state.topo_vect[0, [first + 1, first + size - 1]] = 2
-    action = calm.actions[calm.act()]
-    assert (action.kind, action.target) == (ActionKind.MOVE, sub)
-    assert action.mask == 0b10 | 1 << (size - 1)
+    assert calm.actions[calm.act()] == move(sub, 0b10 | 1 << (size - 1))
 
 
 def test_recovery_waits_while_the_grid_is_not_safe():

@@ -48,15 +48,16 @@ def brute_force_flow(grid: Grid, point: DcPoint, busbar: np.ndarray) -> np.ndarr
 
 
 def after(grid: Grid, point: DcPoint, catalogue: ActionCatalogue, action: int, last: np.ndarray) -> np.ndarray:
-    busbar, step = point.busbar.copy(), catalogue[action]
-    if step.kind == ActionKind.MOVE:
-        for k in range(int(grid.sub_info[step.target])):
-            element = int(grid.sub_first_element[step.target]) + k
-            if step.mask >> k & 1 and busbar[element] > 0:
-                busbar[element] = 3 - busbar[element]
-    if step.kind == ActionKind.SWITCH:
-        for element in (grid.line_or_pos_topo_vect[step.target], grid.line_ex_pos_topo_vect[step.target]):
-            busbar[element] = -1 if busbar[element] > 0 else last[element]
+    busbar = point.busbar.copy()
+    for kind, target, mask in catalogue[action].changes:
+        if kind == ActionKind.MOVE:
+            for k in range(int(grid.sub_info[target])):
+                element = int(grid.sub_first_element[target]) + k
+                if mask >> k & 1 and busbar[element] > 0:
+                    busbar[element] = 3 - busbar[element]
+        if kind == ActionKind.SWITCH:
+            for element in (grid.line_or_pos_topo_vect[target], grid.line_ex_pos_topo_vect[target]):
+                busbar[element] = -1 if busbar[element] > 0 else last[element]
     return busbar
 
 

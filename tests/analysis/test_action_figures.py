@@ -9,7 +9,7 @@ from rl2grid.analysis.action_space import substation_shares, switches_held
 from rl2grid.analysis.figures import png_bytes
 from rl2grid.errors import UsageError
 from rl2grid.grids import load_grid
-from rl2grid.mdp.actions import ActionKind, StepAction
+from rl2grid.mdp.actions import DO_NOTHING, move, switch
 
 BUS14 = load_grid("bus14")
 
@@ -64,16 +64,16 @@ def test_many_actions_are_pooled(tmp_path, monkeypatch):
     assert survival[0] == pytest.approx(arrays["survived"][best] / arrays["trials"][best])
 
 
-@pytest.mark.parametrize("action", [StepAction(ActionKind.MOVE, 5, 0b1010), StepAction(ActionKind.SWITCH, 17)])
+@pytest.mark.parametrize("action", [move(5, 0b1010), switch(17)])
 def test_an_action_is_drawn_and_its_elements_named(action):
     figure = draw_action(BUS14, action)
     assert png_bytes(figure).startswith(b"\x89PNG")
     _, before, after = figure.axes
-    words = {"line 17"} if action.kind == ActionKind.SWITCH else {"line 8", "line 17"}
+    words = {"line 17"} if action == switch(17) else {"line 8", "line 17"}
     for axes in (before, after):
         assert {text.get_text() for text in axes.texts} == words
 
 
 def test_doing_nothing_is_not_drawn():
     with pytest.raises(UsageError, match="there is nothing to draw"):
-        draw_action(BUS14, StepAction())
+        draw_action(BUS14, DO_NOTHING)

@@ -17,7 +17,7 @@ from rl2grid.analysis.action_space import (
 )
 from rl2grid.errors import UsageError
 from rl2grid.grids import load_grid
-from rl2grid.mdp.actions import ActionKind, StepAction, describe, full_catalogue, level_catalogue, moved_elements
+from rl2grid.mdp.actions import ActionKind, describe, full_catalogue, level_catalogue, move, moved_elements, switch
 from rl2grid.mdp.state import new_state
 from rl2grid.mdp.termination import GameOver, game_over_reason
 
@@ -54,7 +54,8 @@ def test_actions_are_selected_by_substation_and_line(level):
         ends = {int(BUS14.line_or_pos_topo_vect[line]), int(BUS14.line_ex_pos_topo_vect[line])}
         concerned = [
             k
-            for k, (kind, target, mask, _) in enumerate(catalogue[k] for k in range(len(catalogue)))
+            for k in range(len(catalogue))
+            for kind, target, mask in catalogue[k].changes
             if (kind == ActionKind.SWITCH and target == line)
             or (kind == ActionKind.MOVE and ends & set(moved_elements(BUS14, target, mask).tolist()))
         ]
@@ -114,7 +115,7 @@ def test_what_is_cut_off_is_what_ends_an_episode(grid_id):
 
 
 def test_a_move_is_explained_element_by_element():
-    action = StepAction(ActionKind.MOVE, 5, 0b1010)
+    action = move(5, 0b1010)
     explanation = explain_action(BUS14, action)
     first = int(BUS14.sub_first_element[5])
     assert [change.name for change in explanation.changes] == element_names(BUS14)[first : first + 7]
@@ -126,7 +127,7 @@ def test_a_move_is_explained_element_by_element():
 
 def test_a_switch_is_explained_with_both_ends_and_what_it_cuts_off():
     line = int(np.flatnonzero((BUS14.line_or_to_subid == 7) | (BUS14.line_ex_to_subid == 7))[0])
-    explanation = explain_action(BUS14, StepAction(ActionKind.SWITCH, line))
+    explanation = explain_action(BUS14, switch(line))
     assert [(change.before, change.after) for change in explanation.changes] == [(1, None), (1, None)]
     (generator,) = np.flatnonzero(BUS14.gen_to_subid == 7)
     assert explanation.cut_off == (f"generator {generator}",)
@@ -137,15 +138,15 @@ def test_an_idle_storage_unit_may_be_cut_off():
     grid = load_grid("bus118-MOB-v0")
     sub = int(grid.storage_to_subid[0])
     bit = int(grid.storage_pos_topo_vect[0] - grid.sub_first_element[sub])
-    explanation = explain_action(grid, StepAction(ActionKind.MOVE, sub, 1 << bit))
+    explanation = explain_action(grid, move(sub, 1 << bit))
     assert explanation.consequence == "Cut off: storage 0. This ends the episode unless the storage is idle."
 
 
 def test_cooldowns_are_those_of_the_grid():
     grid = load_grid("bus36-M")
-    cooldown = explain_action(grid, StepAction(ActionKind.MOVE, 4, 2)).cooldown
+    cooldown = explain_action(grid, move(4, 2)).cooldown
     assert cooldown == "Substation 4 may not be changed for 3 steps (15 minutes) afterwards."
-    reversal = explain_action(grid, StepAction(ActionKind.SWITCH, 4)).reversal
+    reversal = explain_action(grid, switch(4)).reversal
     assert reversal == "The same action closes the line again, once the cooldown is over."
 
 

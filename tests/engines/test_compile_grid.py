@@ -263,7 +263,6 @@ ENVIRONMENT_CHANGES = {
     "its substations have 3 busbars, only 2": lambda e: change_type(e, n_busbar_per_sub=3),
     "loads and generators may be detached": lambda e: change_type(e, detachment_is_allowed=True),
     "its generators have no limits and costs": lambda e: change_type(e, redispatching_unit_commitment_availble=False),
-    "a substation has 33 elements, at most 32": lambda e: change_type(e, sub_info=np.array([3, 33], np.int32)),
     "its time step is 900 s, only 300 s": lambda e: setattr(e, "delta_time_seconds", 900.0),
     "its opponent is RandomLineOpponent, only BaseOpponent, Weighted": lambda e: setattr(
         e._oppSpace, "opponent", RandomLineOpponent(e.action_space)

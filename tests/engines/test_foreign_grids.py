@@ -44,12 +44,13 @@ def begin(engine, scenario):
 
 def play_in_grid2op(environment, grid, action):
     played = environment.action_space()
-    if action.kind == ActionKind.MOVE:
-        moved = np.zeros(grid.dim_topo, np.bool_)
-        moved[moved_elements(grid, action.target, action.mask)] = True
-        played.change_bus = moved
-    elif action.kind == ActionKind.SWITCH:
-        played.line_change_status = [action.target]
+    for kind, target, mask in action.changes:
+        if kind == ActionKind.MOVE:
+            moved = np.zeros(grid.dim_topo, np.bool_)
+            moved[moved_elements(grid, target, mask)] = True
+            played.change_bus = moved
+        elif kind == ActionKind.SWITCH:
+            played.line_change_status = [target]
     return environment.step(played)
 
 
@@ -71,7 +72,7 @@ def test_a_compiled_grid_plays_like_its_environment(environment):
         action = catalogue[int(generator.integers(len(catalogue))) if generator.random() < 0.3 else 0]
         engine.step(0, action)
         observation, _, over, info = play_in_grid2op(environment, compiled.grid, action)
-        changes += action.kind != ActionKind.NOTHING
+        changes += len(action.changes)
         assert bool(engine.state.illegal[0]) == info["is_illegal"], step
         assert bool(engine.state.terminated[0] or engine.state.truncated[0]) == over, step
         assert_equal(engine.state, observation, step)

@@ -17,7 +17,7 @@ from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.engines.native.entry import reset_one
 from rl2grid.errors import UsageError
 from rl2grid.grids import GRID_IDS, load_grid
-from rl2grid.mdp.actions import DO_NOTHING, ActionKind, StepAction, full_catalogue
+from rl2grid.mdp.actions import DO_NOTHING, StepAction, full_catalogue, inject, move, switch
 from rl2grid.mdp.features import observation_size, observation_writer
 from rl2grid.mdp.state import OBSERVED, OBSERVED_STORAGE
 from rl2grid.mdp.termination import GameOver
@@ -87,16 +87,8 @@ class Trial:
             assert not self.state.rho[0].any()
 
 
-def switch(line: int) -> StepAction:
-    return StepAction(int(ActionKind.SWITCH), line)
-
-
-def move(sub: int, mask: int) -> StepAction:
-    return StepAction(int(ActionKind.MOVE), sub, mask)
-
-
 def injection(values: Any) -> StepAction:
-    return StepAction(int(ActionKind.INJECTION), values=np.asarray(values, np.float32))
+    return inject(np.asarray(values, np.float32))
 
 
 def n_continuous(trial: Trial) -> int:

@@ -21,7 +21,7 @@ from rl2grid.engines.reference.engine import ReferenceEngine
 from rl2grid.engines.transition import Transitions
 from rl2grid.errors import UsageError
 from rl2grid.grids import GRID_IDS, load_grid
-from rl2grid.mdp.actions import StepAction, full_catalogue
+from rl2grid.mdp.actions import full_catalogue, switch
 from rl2grid.mdp.rewards import PRESETS
 from rl2grid.mdp.state import new_state
 from rl2grid.mdp.termination import GameOver
@@ -272,7 +272,7 @@ def test_the_last_topology_of_a_lost_game_is_compared():
     """Opening the only line of substation 7 of bus14 cuts its generator off."""
     grid = load_grid("bus14")
     (line,) = np.flatnonzero((grid.line_or_to_subid == 7) | (grid.line_ex_to_subid == 7))
-    fatal = SimpleNamespace(begin=lambda random: None, choose=lambda state, i: StepAction(2, int(line)))
+    fatal = SimpleNamespace(begin=lambda random: None, choose=lambda state, i: switch(int(line)))
     reference, _ = engines("bus14", "exact")
     for tamper, expected in ((change("final_topo_vect", 1), ["final_topo_vect"]), (lambda state, i: None, [])):
         pair = SideBySide(reference, Tampered(1, tamper))

@@ -13,7 +13,7 @@ from lightsim2grid import LightSimBackend
 from rl2grid.engines.reference import engine as engine_module
 from rl2grid.engines.reference.engine import ReferenceEngine
 from rl2grid.grids import GRID_IDS, load_grid
-from rl2grid.mdp.actions import ActionKind, StepAction, continuous_layout, full_catalogue
+from rl2grid.mdp.actions import DO_NOTHING, ActionKind, continuous_layout, full_catalogue, inject, switch
 from rl2grid.mdp.state import OBSERVED, OBSERVED_STORAGE
 from rl2grid.mdp.termination import GameOver
 from rl2grid.scenarios.episodes import EpisodePlan
@@ -64,13 +64,14 @@ def plain_maintenance(plain, scenario, n_line):
 
 def grid2op_action(plain, grid, action):
     """The same action, built the way Grid2Op's documentation does."""
-    if action.kind == ActionKind.MOVE:
-        first = int(grid.sub_first_element[action.target])
-        moved = [first + k for k in range(int(grid.sub_info[action.target])) if action.mask >> k & 1]
-        return plain.action_space({"change_bus": moved})
-    if action.kind == ActionKind.SWITCH:
-        return plain.action_space({"change_line_status": [action.target]})
-    if action.kind == ActionKind.INJECTION:
+    for kind, target, mask in action.changes:
+        if kind == ActionKind.MOVE:
+            first = int(grid.sub_first_element[target])
+            moved = [first + k for k in range(int(grid.sub_info[target])) if mask >> k & 1]
+            return plain.action_space({"change_bus": moved})
+        assert kind == ActionKind.SWITCH
+        return plain.action_space({"change_line_status": [target]})
+    if action.values is not None:
         layout = continuous_layout(grid)
         request = {"curtail": [], "redispatch": [], "set_storage": []}
         entries = iter(action.values.tolist())
@@ -89,14 +90,14 @@ def grid2op_action(plain, grid, action):
 def random_action(grid, kind, random):
     """Often nothing, otherwise a topology action or a small injection."""
     if random.random() < 0.6:
-        return StepAction()
+        return DO_NOTHING
     if kind == "T":
         catalogue = full_catalogue(grid)
         if random.random() < 0.3:
-            return StepAction(int(ActionKind.SWITCH), int(random.integers(grid.n_line)))
+            return switch(int(random.integers(grid.n_line)))
         return catalogue[int(random.integers(len(catalogue)))]
     values = (0.3 * random.uniform(-1, 1, continuous_layout(grid).size)).astype(np.float32)
-    return StepAction(int(ActionKind.INJECTION), values=values)
+    return inject(values)
 
 
 def play_side_by_side(monkeypatch, grid_id, kind, steps, seed):
@@ -172,7 +173,7 @@ def test_game_over_is_explained_and_blanked():
     engine = ReferenceEngine(grid, 1)
     engine.reset(0, EpisodePlan(0, 0, list_scenarios("bus14", "bundled")[0], 0, 100))
     (line,) = np.flatnonzero((grid.line_or_to_subid == 7) | (grid.line_ex_to_subid == 7))
-    engine.step(0, StepAction(int(ActionKind.SWITCH), int(line)))
+    engine.step(0, switch(int(line)))
     assert engine.state.terminated[0]
     assert engine.state.game_over[0] == GameOver.GENERATOR_DISCONNECTED
     assert (engine.state.topo_vect[0] == -1).all()

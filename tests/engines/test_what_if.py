@@ -20,7 +20,7 @@ from rl2grid.engines.native.what_if import (
 )
 from rl2grid.errors import UsageError
 from rl2grid.grids import GRID_IDS, load_grid
-from rl2grid.mdp.actions import ActionKind, StepAction, full_catalogue, legal_actions
+from rl2grid.mdp.actions import ActionKind, full_catalogue, legal_actions
 from rl2grid.mdp.termination import GameOver
 from rl2grid.powerflow.batch import Snapshot
 from rl2grid.scenarios.episodes import plan_episode
@@ -219,7 +219,9 @@ def test_what_cannot_be_asked_is_refused() -> None:
     snapshot = snapshot_of(played("bus14", 0), 0)
     with pytest.raises(UsageError, match="rho must be"):
         solver_of("bus14").actions(snapshot, catalogue, rho=np.zeros((3, grid.n_line), np.float32))
-    restore = type(catalogue)(np.array([ActionKind.RESTORE], np.int8), np.zeros(1, np.int32), np.zeros(1, np.uint32))
+    restore = type(catalogue)(
+        np.array([ActionKind.RESTORE], np.int8), np.zeros(1, np.int32), np.zeros((1, 1), np.uint64)
+    )
     with pytest.raises(UsageError, match="NOTHING, MOVE and SWITCH"):
         solver_of("bus14").actions(snapshot, restore)
     with pytest.raises(UsageError, match="num_threads"):
@@ -231,7 +233,7 @@ def test_a_game_over_cannot_be_asked_about() -> None:
     engine.reset(0, plan_episode(engine.grid, "train", 0, 0))
     catalogue = full_catalogue(engine.grid)
     fatal = int(np.isinf(what_if(engine, 0, catalogue).worst_loading).argmax())
-    engine.step(0, StepAction(*catalogue[fatal][:3]))
+    engine.step(0, catalogue[fatal])
     assert engine.state.terminated[0]
     with pytest.raises(UsageError, match="reset the environment first"):
         snapshot_of(engine, 0)

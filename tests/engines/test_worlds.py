@@ -19,7 +19,7 @@ from rl2grid.engines.native.what_if import forecast_of
 from rl2grid.engines.worlds import Outlook, World, world_of_plain
 from rl2grid.errors import UsageError
 from rl2grid.grids import load_grid
-from rl2grid.mdp.actions import DO_NOTHING, ActionKind, StepAction, continuous_layout, level_catalogue
+from rl2grid.mdp.actions import DO_NOTHING, StepAction, continuous_layout, inject, level_catalogue, switch
 from rl2grid.mdp.opponents import OpponentDraws, draw_opponent
 from rl2grid.scenarios.episodes import EpisodePlan, plan_episode
 from rl2grid.scenarios.library import list_scenarios, load_scenario
@@ -99,7 +99,7 @@ def random_actions(grid_id: str, n: int, seed: int) -> list[StepAction]:
             actions.append(catalogue[int(random.integers(len(catalogue)))])
         elif draw < 0.4:
             values = random.uniform(-0.3, 0.3, width).astype(np.float32)
-            actions.append(StepAction(int(ActionKind.INJECTION), values=values))
+            actions.append(inject(values))
         else:
             actions.append(DO_NOTHING)
     return actions
@@ -181,7 +181,7 @@ def test_a_flow_that_was_never_warm_and_one_that_ended_are_worlds_too(grid_id: s
     begin_eventful(engine)
     other.restore(0, engine.save(0))
     assert rollout(engine, 0, [DO_NOTHING] * 10) == rollout(other, 0, [DO_NOTHING] * 10)
-    lines = [StepAction(int(ActionKind.SWITCH), line) for line in range(engine.grid.n_line)]
+    lines = [switch(line) for line in range(engine.grid.n_line)]
     for action in lines:
         if not over(engine, 0):
             engine.step(0, action)

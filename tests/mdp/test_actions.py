@@ -12,17 +12,19 @@ from rl2grid.grids import GRID_IDS, load_grid
 from rl2grid.mdp.actions import (
     DO_NOTHING,
     ActionKind,
-    StepAction,
     action_set_hash,
     continuous_layout,
     decode_continuous,
     describe,
     full_catalogue,
+    inject,
     is_legal,
     legal_actions,
     level_catalogue,
     level_ids,
     moved_elements,
+    reconnect,
+    restore,
 )
 from rl2grid.mdp.state import new_state
 
@@ -52,14 +54,15 @@ def make_env():
 
 def grid2op_action(env, grid, action):
     """The Grid2Op action that ``action`` stands for."""
-    if action.kind == ActionKind.NOTHING:
+    if not action.changes:
         return env.action_space({})
-    if action.kind == ActionKind.SWITCH:
-        return env.action_space({"change_line_status": [action.target]})
-    if action.kind == ActionKind.RECONNECT:
-        return env.action_space({"set_line_status": [(action.target, 1)]})
+    ((kind, target, mask),) = action.changes
+    if kind == ActionKind.SWITCH:
+        return env.action_space({"change_line_status": [target]})
+    if kind == ActionKind.RECONNECT:
+        return env.action_space({"set_line_status": [(target, 1)]})
     change = np.zeros(grid.dim_topo, bool)
-    change[moved_elements(grid, action.target, action.mask)] = True
+    change[moved_elements(grid, target, mask)] = True
     return env.action_space({"change_bus": change})
 
 
@@ -106,7 +109,7 @@ def test_the_largest_substation_counts_in_lexicographic_order():
     sub = int(grid.sub_info.argmax())
     n = int(grid.sub_info[sub])
     catalogue = full_catalogue(grid)
-    masks = catalogue.mask[(catalogue.kind == ActionKind.MOVE) & (catalogue.target == sub)]
+    masks = catalogue.mask[:, 0][(catalogue.kind == ActionKind.MOVE) & (catalogue.target == sub)]
     assert len(masks) == 2 ** (n - 1) - 1
     vectors = itertools.islice(itertools.product((0, 1), repeat=n - 1), 1, 5000)
     for mask, vector in zip(masks, vectors, strict=False):
@@ -162,9 +165,8 @@ def check_random_play(env, grid, steps, tried, seed):
             accepted, _ = env._game_rules(action=played, env=env)
             assert accepted == ours, (describe(grid, catalogue[action]), accepted)
         for line in np.flatnonzero(~observation.line_status):
-            reconnect = StepAction(ActionKind.RECONNECT, int(line))
-            accepted, _ = env._game_rules(action=grid2op_action(env, grid, reconnect), env=env)
-            assert accepted == is_legal(state, 0, reconnect.kind, reconnect.target)
+            accepted, _ = env._game_rules(action=grid2op_action(env, grid, reconnect(int(line))), env=env)
+            assert accepted == is_legal(state, 0, int(ActionKind.RECONNECT), int(line))
         n_illegal += int((~legal).sum())
         choice = int(rng.choice(np.flatnonzero(legal)))
         observation, _, done, info = env.step(grid2op_action(env, grid, catalogue[tried[choice]]))
@@ -187,7 +189,6 @@ def test_only_the_own_cooldown_counts(kind):
     assert not is_legal(state, 1, int(kind), 3)
     assert is_legal(state, 0, int(kind), 3)
     assert is_legal(state, 1, int(ActionKind.NOTHING), 3)
-    assert is_legal(state, 1, int(ActionKind.INJECTION), 3)
 
 
 @pytest.mark.parametrize("grid_id", GRID_IDS)
@@ -224,14 +225,14 @@ def test_descriptions():
     assert describe(grid, catalogue[1]) == "substation 0: move generator 5 to the other busbar"
     assert describe(grid, catalogue[50]) == "substation 3: move line 6 with load 2 to the other busbar"
     assert describe(grid, catalogue[160]) == "substation 8: move lines 16 and 19 to the other busbar"
-    assert describe(grid, StepAction(ActionKind.RECONNECT, 7)) == f"reconnect line 7 ({grid.name_line[7]})"
-    assert describe(grid, StepAction(ActionKind.RESTORE, 4)) == "substation 4: move everything back to busbar 1"
+    assert describe(grid, reconnect(7)) == f"reconnect line 7 ({grid.name_line[7]})"
+    assert describe(grid, restore(4)) == "substation 4: move everything back to busbar 1"
     values = np.array([0.5, 0, 0, -0.25, 0, 0], np.float32)
-    injection = describe(grid, StepAction(ActionKind.INJECTION, values=values))
+    injection = describe(grid, inject(values))
     gen = grid.name_gen[continuous_layout(grid).curtail[0]]
     assert injection.startswith("redispatch gen_1_0 by +2.5 MW; limit ")
     assert injection.endswith(f"limit {gen} to 75% of its maximum")
-    assert describe(grid, StepAction(ActionKind.INJECTION, values=np.zeros(6, np.float32))) == "do nothing"
+    assert describe(grid, inject(np.zeros(6, np.float32))) == "do nothing"
 
 
 def test_every_description_is_different():

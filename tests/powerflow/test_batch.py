@@ -87,7 +87,7 @@ class Case:
         chosen = moves[draw.integers(bounds[subs], bounds[subs + 1])]
         kind = np.repeat([NOTHING, SWITCH, MOVE], [1, grid.n_line, n]).astype(np.int8)
         target = np.concatenate(([0], np.arange(grid.n_line), catalogue.target[chosen])).astype(np.int32)
-        mask = np.concatenate((np.zeros(1 + grid.n_line, np.uint32), catalogue.mask[chosen]))
+        mask = np.concatenate((np.zeros((1 + grid.n_line, 1), np.uint64), catalogue.mask[chosen]))
         return Changes(kind, target, mask)
 
     def solve(self, snapshot: Snapshot, changes: Changes, order: Any = None) -> batch.ChangeOutcomes:

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from rl2grid.agents.agent import Action, Info, Observation
 from rl2grid.agents.recovery import Recovery
-from rl2grid.arrays import F64, I64, Flags
+from rl2grid.arrays import F64, Flags
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
-from rl2grid.mdp.actions import ActionCatalogue, ActionKind, full_catalogue
+from rl2grid.mdp.actions import WORD_BITS, ActionCatalogue, ActionKind, Masks, full_catalogue, mask_words
 from rl2grid.mdp.heuristics import SAFE_RHO, is_safe
 from rl2grid.mdp.state import GridState
 
@@ -141,18 +141,26 @@ def effects(grid: Grid, state: GridState, catalogue: ActionCatalogue) -> Effect:
     restores, can_be_undone = np.zeros(len(catalogue), np.bool_), np.ones(len(catalogue), np.bool_)
     restores[switches] = ~state.line_status[0][catalogue.target[switches]]
     on_second, connected = _masks(grid, state.topo_vect[0] == 2), _masks(grid, state.topo_vect[0] > 0)
-    subs, masks = catalogue.target[moves], catalogue.mask[moves].astype(np.int64)
+    subs, masks = catalogue.target[moves], catalogue.mask[moves]
     after = (on_second[subs] ^ masks) & connected[subs]
-    restores[moves] = (after == 0) & (on_second[subs] != 0)
-    way_back = set(zip(subs.tolist(), masks.tolist(), strict=True))
-    keys = zip(subs.tolist(), after.tolist(), strict=True)
-    can_be_undone[moves] = [mask == 0 or (sub, mask) in way_back for sub, mask in keys]
+    all_on_first = ~after.any(axis=1)
+    restores[moves] = all_on_first & on_second[subs].any(axis=1)
+    way_back = set(zip(subs.tolist(), _keys(masks), strict=True))
+    keys = zip(subs.tolist(), _keys(after), strict=True)
+    can_be_undone[moves] = all_on_first | np.fromiter((key in way_back for key in keys), np.bool_, len(subs))
     return Effect(restores, can_be_undone)
 
 
-def _masks(grid: Grid, flags: NDArray[np.bool_]) -> I64:
-    """The flagged elements of each substation as the mask of a move, int64 [sub]."""
+def _keys(masks: Masks) -> list[bytes]:
+    """Every mask, uint64 [action, word], as something to look up."""
+    packed, size = masks.tobytes(), masks.shape[1] * masks.itemsize
+    return [packed[begin : begin + size] for begin in range(0, len(packed), size)]
+
+
+def _masks(grid: Grid, flags: NDArray[np.bool_]) -> Masks:
+    """The flagged elements of each substation as the mask of a move, uint64 [sub, word]."""
     place = np.arange(grid.dim_topo) - grid.sub_first_element[grid.element_to_subid]
-    masks = np.zeros(grid.n_sub, np.int64)
-    np.add.at(masks, grid.element_to_subid[flags], np.int64(1) << place[flags])
+    word, bit = np.divmod(place[flags], WORD_BITS)
+    masks = np.zeros((grid.n_sub, mask_words(grid)), np.uint64)
+    np.bitwise_or.at(masks, (grid.element_to_subid[flags], word), np.uint64(1) << bit.astype(np.uint64))
     return masks

@@ -193,8 +193,7 @@ class _Topology:
         first = int(self._grid.sub_first_element[sub])
         ends = range(first, first + int(self._grid.sub_info[sub]))
         mask = sum(1 << (e - first) for e in ends if e in self._moved and values[self._moved[e]] > 0.5)
-        same = (self._catalogue.kind == ActionKind.MOVE) & (self._catalogue.target == sub)
-        return int(np.flatnonzero(same & (self._catalogue.mask == mask))[0])
+        return self._catalogue.find(ActionKind.MOVE, sub, mask)
 
     # Which actions there are: at most one of them, and what each element does then.
 
@@ -240,8 +239,8 @@ class _Topology:
 
     def _closed_elements(self, action: int) -> list[int]:
         """The elements that a move changes: those that are off stay off."""
-        step = self._catalogue[action]
-        elements = moved_elements(self._grid, step.target, step.mask)
+        (change,) = self._catalogue[action].changes
+        elements = moved_elements(self._grid, change.target, change.mask)
         return [int(element) for element in elements if self._point.busbar[element] > 0]
 
     def _on_second(self, element: int) -> Affine:

@@ -40,7 +40,7 @@ class Recovery:
         base: Any = env.unwrapped
         self._env = base
         actions = full_catalogue(base.grid).take(base.action_catalogue_ids)
-        keys = zip(actions.kind.tolist(), actions.target.tolist(), actions.mask.tolist(), strict=True)
+        keys = zip(actions.kind.tolist(), actions.target.tolist(), actions.masks(), strict=True)
         self._action = {key: action for action, key in enumerate(keys)}
 
     def reset(self, i: int) -> None:

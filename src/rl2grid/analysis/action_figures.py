@@ -178,7 +178,7 @@ def draw_action(grid: Grid, action: StepAction, *, theme: Theme = LIGHT) -> Figu
     Raises:
         UsageError: the action does nothing.
     """
-    if action.kind == ActionKind.NOTHING:
+    if not action.changes:
         raise UsageError("Do nothing changes nothing, so there is nothing to draw: choose another action.")
     highlighted = np.zeros(grid.dim_topo, np.bool_)
     highlighted[changed_elements(grid, action)] = True
@@ -284,12 +284,13 @@ def _draw_boundaries(panels: Sequence[Axes], grid: Grid, theme: Theme) -> None:
 
 def _label_elements(axes: Axes, drawing: GridDrawing, grid: Grid, action: StepAction, theme: Theme) -> None:
     """Short names of the changed elements, each as near as the others leave room."""
-    if action.kind == ActionKind.SWITCH:
-        _label_line(axes, drawing, grid, action.target, theme)
-        return
+    for change in action.changes:
+        if change.kind == ActionKind.SWITCH:
+            _label_line(axes, drawing, grid, change.target, theme)
     names = element_names(grid)
     taken: list[tuple[float, float]] = []
-    for element in changed_elements(grid, action).tolist():
+    moves = StepAction(tuple(change for change in action.changes if change.kind == ActionKind.MOVE))
+    for element in changed_elements(grid, moves).tolist():
         name = names[element].split(" to ")[0].replace("generator", "gen")
         # About what a label takes, in the units of the layout.
         size = (5.6 * len(name) / drawing.points * drawing.unit, 12.0 / drawing.points * drawing.unit)

@@ -14,7 +14,9 @@ from rl2grid.errors import UsageError
 from rl2grid.grids import STEPS_PER_HOUR, Grid
 from rl2grid.grids.rankings import ranking, trials
 from rl2grid.mdp.actions import (
+    WORD_BITS,
     ActionKind,
+    Change,
     Ids,
     StepAction,
     describe,
@@ -87,8 +89,9 @@ def select_actions(grid: Grid, level: int, *, substation: int | None = None, lin
         concerned = (catalogue.kind == ActionKind.SWITCH) & (catalogue.target == line)
         for element in (int(grid.line_or_pos_topo_vect[line]), int(grid.line_ex_pos_topo_vect[line])):
             sub = int(grid.element_to_subid[element])
-            bit = np.uint32(element - int(grid.sub_first_element[sub]))
-            concerned |= moves & (catalogue.target == sub) & ((catalogue.mask >> bit & np.uint32(1)) == 1)
+            word, bit = divmod(element - int(grid.sub_first_element[sub]), WORD_BITS)
+            moved = catalogue.mask[:, word] >> np.uint64(bit) & np.uint64(1) == 1
+            concerned |= moves & (catalogue.target == sub) & moved
         chosen &= concerned
     return np.flatnonzero(chosen).astype(np.int32)
 
@@ -170,18 +173,30 @@ def explain_action(grid: Grid, action: StepAction) -> Explanation:
 def topology_after(grid: Grid, action: StepAction) -> NDArray[np.int32]:
     """``topo_vect`` after an action of the catalogue in the reference topology, int32 [topo]."""
     topology = _reference(grid)
-    topology[changed_elements(grid, action)] = -1 if action.kind == ActionKind.SWITCH else 2
+    # Lines last: an end that is moved and opened is open.
+    for change in sorted(action.changes, key=lambda each: each.kind == ActionKind.SWITCH):
+        topology[_changed_elements(grid, change)] = -1 if change.kind == ActionKind.SWITCH else 2
     return topology
 
 
 def changed_elements(grid: Grid, action: StepAction) -> Ids:
-    """Entries of ``topo_vect`` that an action of the catalogue changes."""
-    if action.kind == ActionKind.MOVE:
-        return moved_elements(grid, action.target, action.mask)
-    if action.kind == ActionKind.SWITCH:
-        ends = (grid.line_or_pos_topo_vect[action.target], grid.line_ex_pos_topo_vect[action.target])
+    """Entries of ``topo_vect`` that an action changes in the reference topology, by change."""
+    return _joined([_changed_elements(grid, change) for change in action.changes])
+
+
+def _changed_elements(grid: Grid, change: Change) -> Ids:
+    if change.kind == ActionKind.MOVE:
+        return moved_elements(grid, change.target, change.mask)
+    if change.kind == ActionKind.SWITCH:
+        ends = (grid.line_or_pos_topo_vect[change.target], grid.line_ex_pos_topo_vect[change.target])
         return np.array(ends, np.int32)
     return np.zeros(0, np.int32)
+
+
+def _joined(parts: list[Ids]) -> Ids:
+    """The different entries of all parts, in the order of the parts."""
+    entries = dict.fromkeys(int(entry) for part in parts for entry in part)
+    return np.array(list(entries), np.int32)
 
 
 def cut_off_elements(grid: Grid, topo_vect: NDArray[np.int32]) -> Ids:
@@ -268,10 +283,14 @@ def _moves_by_substation(grid: Grid, ids: Ids) -> NDArray[np.int64]:
 
 def _concerned(grid: Grid, action: StepAction) -> Ids:
     """Entries of ``topo_vect`` that an explanation lists."""
-    if action.kind != ActionKind.MOVE:
-        return changed_elements(grid, action)
-    first = int(grid.sub_first_element[action.target])
-    return np.arange(first, first + int(grid.sub_info[action.target]), dtype=np.int32)
+    return _joined([_concerned_by(grid, change) for change in action.changes])
+
+
+def _concerned_by(grid: Grid, change: Change) -> Ids:
+    if change.kind != ActionKind.MOVE:
+        return _changed_elements(grid, change)
+    first = int(grid.sub_first_element[change.target])
+    return np.arange(first, first + int(grid.sub_info[change.target]), dtype=np.int32)
 
 
 def _reference(grid: Grid) -> NDArray[np.int32]:
@@ -292,10 +311,14 @@ def _consequence_in_words(cut_off: Sequence[str]) -> str:
 
 
 def _cooldown_in_words(grid: Grid, action: StepAction) -> str:
-    if action.kind == ActionKind.NOTHING:
+    if not action.changes:
         return "None: doing nothing is always allowed."
-    of_line = action.kind == ActionKind.SWITCH
-    what = f"{'line' if of_line else 'substation'} {action.target}"
+    return " ".join(_cooldown_of_change(grid, change) for change in action.changes)
+
+
+def _cooldown_of_change(grid: Grid, change: Change) -> str:
+    of_line = change.kind == ActionKind.SWITCH
+    what = f"{'line' if of_line else 'substation'} {change.target}"
     steps = grid.rules.cooldown_line if of_line else grid.rules.cooldown_sub
     if steps == 0:
         return f"None: {what} may be changed again in the next step."
@@ -304,10 +327,14 @@ def _cooldown_in_words(grid: Grid, action: StepAction) -> str:
 
 
 def _reversal_in_words(grid: Grid, action: StepAction) -> str:
-    if action.kind == ActionKind.NOTHING:
+    if not action.changes:
         return "There is nothing to take back."
-    wait = grid.rules.cooldown_line if action.kind == ActionKind.SWITCH else grid.rules.cooldown_sub
+    return " ".join(_reversal_of_change(grid, change) for change in action.changes)
+
+
+def _reversal_of_change(grid: Grid, change: Change) -> str:
+    wait = grid.rules.cooldown_line if change.kind == ActionKind.SWITCH else grid.rules.cooldown_sub
     when = "once the cooldown is over" if wait else "in any later step"
-    if action.kind == ActionKind.SWITCH:
+    if change.kind == ActionKind.SWITCH:
         return f"The same action closes the line again, {when}."
     return f"The same action moves the elements back, {when}; elements out of service do not move."

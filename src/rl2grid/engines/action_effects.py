@@ -8,8 +8,8 @@ import numpy as np
 
 from rl2grid.arrays import F32, Flags
 from rl2grid.grids import Grid
-from rl2grid.mdp.actions import ActionKind, StepAction, decode_continuous
-from rl2grid.mdp.state import GridState
+from rl2grid.mdp.actions import StepAction, decode_continuous
+from rl2grid.mdp.legality import AMBIGUOUS, LEGAL, LINE_COOLS_DOWN, TOO_MANY_LINES, TOO_MANY_SUBS, Verdict
 
 _TOLERANCE = 0.05
 """MW below which a difference between what was asked and what happened is not worth a word."""
@@ -32,26 +32,25 @@ class AfterAction(Protocol):
     def storage_power(self) -> F32: ...
 
 
-def cooldown_left(state: GridState, i: int, action: StepAction) -> int:
-    """Steps that the line or substation of a topology action cools down in the state before it."""
-    if action.kind == ActionKind.MOVE:
-        return int(state.time_before_cooldown_sub[i, action.target])
-    if action.kind == ActionKind.SWITCH:
-        return int(state.time_before_cooldown_line[i, action.target])
-    return 0
-
-
-def refusal(action: StepAction, left: int) -> str:
-    """Why the rules refuse a topology action whose target cools down; empty where ``left`` is 0."""
-    if left == 0:
+def refusal(grid: Grid, verdict: Verdict) -> str:
+    """Why the rules refuse an action; empty where they do not."""
+    if verdict.reason == LEGAL:
         return ""
-    target = "substation" if action.kind == ActionKind.MOVE else "line"
-    return f"refused: {target} {action.target} cools down for {left} more steps"
+    if verdict.reason == AMBIGUOUS:
+        return "refused: the action has no single meaning"
+    if verdict.reason in (TOO_MANY_LINES, TOO_MANY_SUBS):
+        of_lines = verdict.reason == TOO_MANY_LINES
+        most = grid.rules.max_line_changes if of_lines else grid.rules.max_sub_changes
+        noun = f"{'line' if of_lines else 'substation'}{'' if most == 1 else 's'}"
+        area = " of one area" if grid.sub_area.any() else ""
+        return f"refused: one action may change {most} {noun}{area}"
+    target = "line" if verdict.reason == LINE_COOLS_DOWN else "substation"
+    return f"refused: {target} {verdict.target} cools down for {verdict.left} more steps"
 
 
 def clipping(grid: Grid, state: AfterAction, i: int, action: StepAction) -> str:
     """What of a continuous action was not carried out, read from the state right after its step."""
-    if action.kind != ActionKind.INJECTION or action.values is None or state.terminated[i]:
+    if action.values is None or state.terminated[i]:
         return ""
     if state.ambiguous[i]:
         return "refused: the action has no single meaning"

@@ -369,8 +369,8 @@ def _as_rows(state: GridState, names: tuple[str, ...]) -> Arrays:
 
 
 def _in_short(action: StepAction) -> str:
-    name = ActionKind(action.kind).name.lower()
-    return name if action.values is not None else f"{name} {action.target} mask {action.mask:#x}"
+    changes = [f"{ActionKind(kind).name.lower()} {target} mask {mask:#x}" for kind, target, mask in action.changes]
+    return " + ".join([*changes, *(["injection"] if action.values is not None else [])]) or "nothing"
 
 
 @jit

@@ -9,11 +9,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from rl2grid.engines.action_effects import clipping, cooldown_left, refusal
+from rl2grid.engines.action_effects import clipping, refusal
 from rl2grid.engines.base import Engine
 from rl2grid.mdp.accumulate import accrue, begin_episode, begin_transition
-from rl2grid.mdp.actions import DO_NOTHING, StepAction
+from rl2grid.mdp.actions import DO_NOTHING, StepAction, one_change
 from rl2grid.mdp.heuristics import is_safe, reconnect_action, recovery_action
+from rl2grid.mdp.legality import verdict_on
 from rl2grid.mdp.rewards import RewardFunction
 from rl2grid.mdp.state import GridState
 from rl2grid.scenarios.episodes import EpisodePlan
@@ -56,7 +57,7 @@ class Transitions:
         if state.decisions[i] > 0:
             begin_transition(state, i)
         state.decisions[i] += 1
-        refused = refusal(action, cooldown_left(state, i, action))
+        refused = refusal(self.engine.grid, verdict_on(state, i, action))
         self._step(i, action)
         self.action_effects[i] = refused or clipping(self.engine.grid, state, i, action)
         illegal, ambiguous = state.illegal[i], state.ambiguous[i]
@@ -82,7 +83,7 @@ class Transitions:
             return DO_NOTHING
         decide = recovery_action if self.topology_task else reconnect_action
         kind, target = decide(self.engine.state, i)
-        return StepAction(kind, target)
+        return one_change(kind, target)
 
     def _step(self, i: int, action: StepAction) -> None:
         self.engine.step(i, action)

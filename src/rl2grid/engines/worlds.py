@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
-from rl2grid.mdp.actions import StepAction
+from rl2grid.mdp.actions import Change, StepAction
 from rl2grid.scenarios.episodes import EpisodePlan
 
 _OUTLOOK_ARRAYS = ("load_p", "load_q", "prod_p", "prod_v")
@@ -303,7 +303,7 @@ def _array_of(plain: Mapping[str, Any]) -> F32:
 
 def _plain_history(history: History) -> dict[str, Any]:
     actions = [
-        [action.kind, action.target, action.mask, None if action.values is None else action.values.tolist()]
+        [[list(change) for change in action.changes], None if action.values is None else action.values.tolist()]
         for action in history.actions
     ]
     return {"plan": _plain_plan(history.plan), "actions": actions}
@@ -311,8 +311,10 @@ def _plain_history(history: History) -> dict[str, Any]:
 
 def _history_of_plain(plain: Mapping[str, Any]) -> History:
     actions = tuple(
-        StepAction(kind, target, mask, None if values is None else np.array(values, np.float32))
-        for kind, target, mask, values in plain["actions"]
+        StepAction(
+            tuple(Change(*change) for change in changes), None if values is None else np.array(values, np.float32)
+        )
+        for changes, values in plain["actions"]
     )
     return History(EpisodePlan(**plain["plan"]), actions)
 

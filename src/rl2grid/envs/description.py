@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rl2grid.envs.tasks import Task
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
-from rl2grid.mdp.actions import ActionKind, StepAction, describe, level_catalogue, level_ids, validate_continuous
+from rl2grid.mdp.actions import describe, inject, level_catalogue, level_ids, validate_continuous
 from rl2grid.mdp.features import feature_slices, observation_size
 
 
@@ -80,4 +80,4 @@ class TaskDescription:
             catalogue = level_catalogue(self.task.grid, self.task.level)
             return describe(self.task.grid, catalogue[action_number(action, len(catalogue))])
         values = validate_continuous(self.task.grid, action)
-        return describe(self.task.grid, StepAction(int(ActionKind.INJECTION), values=values))
+        return describe(self.task.grid, inject(values))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Self, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from rl2grid.engines.action_effects import clipping, cooldown_left, refusal
+from rl2grid.engines.action_effects import clipping, refusal
 from rl2grid.engines.base import Engine
 from rl2grid.engines.transition import Listener, Transitions
 from rl2grid.engines.worlds import Standing, Trail, World
@@ -21,14 +21,15 @@ from rl2grid.envs.options import TaskOptions
 from rl2grid.envs.tasks import Task
 from rl2grid.errors import UsageError
 from rl2grid.mdp.actions import (
-    ActionKind,
     StepAction,
     action_set_hash,
+    inject,
     legal_actions,
     level_catalogue,
     validate_continuous,
 )
 from rl2grid.mdp.features import observation_size, observation_writer, physical_scale
+from rl2grid.mdp.legality import verdict_on
 from rl2grid.mdp.rewards import resolve_reward
 from rl2grid.mdp.state import GridState
 from rl2grid.scenarios.episodes import EpisodePlan, plan_episode
@@ -185,7 +186,7 @@ class Environments:
         plan, played = self._plans[i], self._step_action(action)
         if plan is None or self.is_over(i):
             raise UsageError("There is no episode in progress to simulate from: call reset first.")
-        effect = refusal(played, cooldown_left(self.state, i, played))
+        effect = refusal(self.grid, verdict_on(self.state, i, played))
         result = self.transitions.simulate(i, played, horizon)
         observation = np.zeros(observation_size(self.grid, self.task.kind), np.float32)
         self._observe(result, 0, observation)
@@ -394,7 +395,7 @@ class Environments:
 
     def _step_action(self, action: Any) -> StepAction:
         if self._catalogue is None:
-            return StepAction(int(ActionKind.INJECTION), values=validate_continuous(self.grid, action))
+            return inject(validate_continuous(self.grid, action))
         return self._catalogue[action_number(action, len(self._catalogue))]
 
 

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rl2grid.arrays import I64
-from rl2grid.engines.native.transitions import Commands, NativeTransitions
+from rl2grid.engines.native.transitions import Commands, NativeTransitions, commands_of
 from rl2grid.envs.engine_rows import EngineRows
 from rl2grid.envs.options import TaskOptions
 from rl2grid.envs.tasks import Task
-from rl2grid.mdp.actions import ActionKind
+from rl2grid.mdp.actions import DO_NOTHING
 from rl2grid.scenarios.episodes import EpisodePlan
 
 
@@ -25,6 +26,8 @@ class NativeRows(EngineRows[Commands]):
     def __init__(self, task: Task, options: TaskOptions, n: int, num_threads: int | None) -> None:
         super().__init__(task, options, n)
         self._num_threads = num_threads or os.cpu_count() or 1
+        self._one_change_each = np.arange(n + 1)
+        self._injections = replace(commands_of(task.grid, [DO_NOTHING] * n), injects=np.ones(n, np.bool_))
         self._buffers = [np.zeros((n, self._size), np.float32) for _ in range(2)]
 
     def _arguments(self) -> tuple[Any, ...]:
@@ -62,9 +65,11 @@ class NativeRows(EngineRows[Commands]):
             self._check(actions)
         kinds, targets, masks = self._catalogue.kind, self._catalogue.target, self._catalogue.mask
         return Commands(
+            self._one_change_each,
             kinds[numbers].astype(np.int64),
             targets[numbers].astype(np.int64),
-            masks[numbers].astype(np.int64),
+            masks[numbers],
+            np.zeros(self._n, np.bool_),
             np.zeros((self._n, 0), np.float32),
         )
 
@@ -77,5 +82,4 @@ class NativeRows(EngineRows[Commands]):
         # NaN compares as false.
         if values.shape != (self._n, self.task.n_actions) or not (np.abs(values) <= 1).all():
             self._check(actions)
-        zeros = np.zeros(self._n, np.int64)
-        return Commands(np.full(self._n, int(ActionKind.INJECTION)), zeros, zeros, values)
+        return replace(self._injections, values=values)

@@ -32,16 +32,18 @@ def busbars_after(grid: Grid, busbar: I32, last_busbar: I32, action: StepAction)
         grid: the grid.
         busbar: busbar of each element, -1 when off, int32 [topo].
         last_busbar: the busbar to which the end of an open line returns, int32 [topo].
-        action: of kind NOTHING, MOVE or SWITCH.
+        action: changes of kind MOVE and SWITCH.
     """
     result = busbar.copy()
-    if action.kind == ActionKind.MOVE:
-        elements = moved_elements(grid, action.target, action.mask)
-        elements = elements[result[elements] > 0]
-        result[elements] = 3 - result[elements]
-    elif action.kind == ActionKind.SWITCH:
-        ends = [int(grid.line_or_pos_topo_vect[action.target]), int(grid.line_ex_pos_topo_vect[action.target])]
-        result[ends] = -1 if (result[ends] > 0).any() else last_busbar[ends]
+    for change in action.changes:
+        if change.kind == ActionKind.SWITCH:
+            ends = [int(grid.line_or_pos_topo_vect[change.target]), int(grid.line_ex_pos_topo_vect[change.target])]
+            result[ends] = -1 if (result[ends] > 0).any() else last_busbar[ends]
+    for change in action.changes:
+        if change.kind == ActionKind.MOVE:
+            elements = moved_elements(grid, change.target, change.mask)
+            elements = elements[result[elements] > 0]
+            result[elements] = 3 - result[elements]
     return result
 
 

@@ -1,11 +1,18 @@
-"""Actions: the catalogue of topology actions, its difficulty levels, legality, and continuous actions.
+"""Actions: what an engine plays in a step, the catalogue of topology actions, its levels, and continuous actions.
+
+An action is any number of *changes* of lines and substations and at most one *injection*
+(:class:`StepAction`); which of them the rules allow is told by :mod:`rl2grid.mdp.legality`. Tasks offer
+actions of one change, or injections.
 
 The full catalogue of a grid holds do nothing, then every move of a set of one substation's elements
 to the other busbar, then the switch of every line: sum over substations of ``2^(n - 1) - 1`` plus
 ``n_line + 1`` actions (paper, Section 3.1). Its order is that of Grid2Op's ``DiscreteActSpace`` with
 ``change_bus`` and ``change_line_status``. Moving a set and moving all other elements of the
 substation are electrically the same; of the two, the catalogue keeps the one that leaves the first
-element where it is, as Grid2Op does.
+element where it is, as Grid2Op does. Grids with larger substations have a :func:`limited_catalogue`.
+
+The elements that a move concerns are a mask. In a value it is a Python integer of any size; in arrays it is
+a row of 64-bit words, the lowest bits first, of which the grids of the project need one.
 """
 
 from __future__ import annotations
@@ -13,6 +20,8 @@ from __future__ import annotations
 import enum
 import functools
 import hashlib
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -28,13 +37,21 @@ from rl2grid.mdp.state import GridState
 
 Kinds = NDArray[np.int8]
 Ids = NDArray[np.int32]
-Masks = NDArray[np.uint32]
+Masks = NDArray[np.uint64]
+
+
+LARGEST_CATALOGUE = 1 << 22
+"""Actions that :func:`full_catalogue` enumerates at most: a substation of 22 elements has half of them."""
+WORD_BITS = 64
+_WORD = (1 << WORD_BITS) - 1
+_SHORT_HASH_ELEMENTS = 32
 
 
 class ActionKind(enum.IntEnum):
-    """What an action does; ``target`` is a line or a substation."""
+    """What a change does; ``target`` is a line or a substation."""
 
     NOTHING = 0
+    """In catalogues and batches only: an action that does nothing has no changes."""
     MOVE = 1
     """Move the masked elements of a substation to the other busbar (``change_bus``)."""
     SWITCH = 2
@@ -43,60 +60,243 @@ class ActionKind(enum.IntEnum):
     """Close a line, both ends to the busbars they were on last (``set_line_status`` +1)."""
     RESTORE = 4
     """Move every connected element of a substation that is on busbar 2 back to busbar 1."""
-    INJECTION = 5
-    """Redispatch, curtail and use storage: ``values`` is the action of the continuous tasks."""
 
 
-_NOTHING, _MOVE, _SWITCH, _RECONNECT, _RESTORE = (int(kind) for kind in list(ActionKind)[:5])
+_NOTHING, _MOVE, _SWITCH, _RECONNECT, _RESTORE = (int(kind) for kind in ActionKind)
 
 
-class StepAction(NamedTuple):
-    """What an engine plays in one step."""
+class Change(NamedTuple):
+    """What an action does to one line or one substation."""
 
-    kind: int = int(ActionKind.NOTHING)
-    target: int = 0
+    kind: int
+    """An :class:`ActionKind` other than NOTHING."""
+    target: int
     """Line (SWITCH, RECONNECT) or substation (MOVE, RESTORE)."""
     mask: int = 0
     """MOVE: bit k is the k-th element of the substation, entry ``sub_first_element + k`` of ``topo_vect``."""
-    values: F32 | None = None
-    """INJECTION: the Box action, float32 [continuous]; see :func:`decode_continuous`."""
+
+    @property
+    def is_of_line(self) -> bool:
+        """Whether ``target`` is a line."""
+        return self.kind in (_SWITCH, _RECONNECT)
+
+
+class _Parts(NamedTuple):
+    changes: tuple[Change, ...]
+    values: F32 | None
+
+
+class StepAction(_Parts):
+    """What an engine plays in one step: changes of lines and substations, and an injection.
+
+    All of it is played, or, where it is illegal or ambiguous, nothing; see :mod:`rl2grid.mdp.legality`. The
+    order of the changes has no meaning: lines are switched first, then elements moved, then substations
+    restored, as Grid2Op merges an action.
+
+    Args:
+        changes: at most one of each line and each substation.
+        values: redispatch, curtailment and storage, float32 [continuous], see :func:`decode_continuous`; None:
+            no injection.
+
+    Raises:
+        UsageError: two changes of one line or substation, or a change that changes nothing.
+    """
+
+    __slots__ = ()
+
+    def __new__(cls, changes: tuple[Change, ...] = (), values: F32 | None = None) -> StepAction:
+        """Check that the changes do not speak of the same thing twice."""
+        for change in changes:
+            if not _MOVE <= change.kind <= _RESTORE:
+                raise UsageError(f"{change.kind!r} is no kind of change: give MOVE, SWITCH, RECONNECT or RESTORE.")
+        if len(changes) > 1:
+            _refuse_repeated_targets(changes)
+        return super().__new__(cls, changes, values)
 
 
 DO_NOTHING = StepAction()
 
 
+def move(sub: int, mask: int) -> StepAction:
+    """Move the masked elements of a substation to the other busbar."""
+    return StepAction((Change(_MOVE, sub, mask),))
+
+
+def switch(line: int) -> StepAction:
+    """Open a closed line, close an open one."""
+    return StepAction((Change(_SWITCH, line),))
+
+
+def reconnect(line: int) -> StepAction:
+    """Close a line, both ends to the busbars they were on last."""
+    return StepAction((Change(_RECONNECT, line),))
+
+
+def restore(sub: int) -> StepAction:
+    """Move every connected element of a substation that is on busbar 2 back to busbar 1."""
+    return StepAction((Change(_RESTORE, sub),))
+
+
+def inject(values: F32) -> StepAction:
+    """Redispatch, curtail and use storage: ``values`` is the action of the continuous tasks, float32 [continuous]."""
+    return StepAction((), values)
+
+
+def one_change(kind: int, target: int, mask: int = 0) -> StepAction:
+    """The action of one change, of which the kind may be NOTHING: what heuristics and catalogues name."""
+    return DO_NOTHING if kind == _NOTHING else StepAction((Change(kind, target, mask),))
+
+
+def joint(*actions: StepAction) -> StepAction:
+    """Several actions as one.
+
+    Raises:
+        UsageError: two of them change one line or substation, or two inject.
+    """
+    injections = [action.values for action in actions if action.values is not None]
+    if len(injections) > 1:
+        raise UsageError(f"{len(injections)} of the actions inject: an action has one injection at most.")
+    changes = tuple(change for action in actions for change in action.changes)
+    return StepAction(changes, injections[0] if injections else None)
+
+
+def check_changes(grid: Grid, changes: Sequence[Change]) -> None:
+    """Refuse changes of what the grid does not have; engines do before they play an action.
+
+    Raises:
+        UsageError: a line, substation or element that does not exist.
+    """
+    for change in changes:
+        kind, target, mask = change
+        if kind in (_SWITCH, _RECONNECT):
+            if not 0 <= target < grid.n_line:
+                raise UsageError(f"Line {target} of {grid.id} does not exist: choose from 0 to {grid.n_line - 1}.")
+            continue
+        sizes = _substation_sizes(grid)
+        if not 0 <= target < len(sizes):
+            raise UsageError(f"Substation {target} of {grid.id} does not exist: choose from 0 to {len(sizes) - 1}.")
+        if mask and not 0 < mask < 1 << sizes[target]:
+            raise UsageError(
+                f"Mask {mask:#x} names elements that substation {target} of {grid.id} does not have: "
+                f"of its {sizes[target]} elements, bit k is the k-th."
+            )
+
+
+def _refuse_repeated_targets(changes: tuple[Change, ...]) -> None:
+    targets = [(change.kind in (_SWITCH, _RECONNECT), change.target) for change in changes]
+    if len(set(targets)) == len(targets):
+        return
+    is_line, target = next(each for k, each in enumerate(targets) if each in targets[:k])
+    what = "line" if is_line else "substation"
+    raise UsageError(f"Two changes of one action are of {what} {target}: give one change of each line and substation.")
+
+
+@functools.cache
+def _substation_sizes(grid: Grid) -> tuple[int, ...]:
+    return tuple(grid.sub_info.tolist())
+
+
+def mask_words(grid: Grid) -> int:
+    """64-bit words of a mask of the largest substation of ``grid``."""
+    return -(-int(grid.sub_info.max()) // WORD_BITS)
+
+
+def write_mask(mask: int, out: Masks) -> None:
+    """Write a mask as 64-bit words, the lowest bits first, to ``out`` [word]."""
+    for word in range(len(out)):
+        out[word] = mask >> WORD_BITS * word & _WORD
+
+
+def mask_integer(words: Masks) -> int:
+    """The mask of which the words are given, uint64 [word]."""
+    return sum(int(word) << WORD_BITS * k for k, word in enumerate(words))
+
+
 @dataclass(frozen=True, eq=False)
 class ActionCatalogue:
-    """A list of topology actions as arrays; the position in it is the action's id. Read-only."""
+    """A list of topology actions of one change as arrays; the position in it is the action's id. Read-only."""
 
     kind: Kinds
     """[action] an :class:`ActionKind`."""
     target: Ids
     """[action] line or substation."""
     mask: Masks
-    """[action] moved elements; 0 unless the kind is MOVE."""
+    """[action, word] moved elements; 0 unless the kind is MOVE."""
 
     def __len__(self) -> int:
         return len(self.kind)
 
     def __getitem__(self, action: int) -> StepAction:
-        return StepAction(int(self.kind[action]), int(self.target[action]), int(self.mask[action]))
+        return one_change(int(self.kind[action]), int(self.target[action]), mask_integer(self.mask[action]))
 
     def take(self, ids: Ids) -> ActionCatalogue:
         """The actions ``ids`` of this catalogue, in that order."""
         return _read_only(self.kind[ids], self.target[ids], self.mask[ids])
 
+    def masks(self) -> list[int]:
+        """The mask of every action as an integer."""
+        if self.mask.shape[1] == 1:
+            return [int(words) for words in self.mask[:, 0].tolist()]
+        return [mask_integer(words) for words in self.mask]
+
+    def find(self, kind: int, target: int, mask: int = 0) -> int:
+        """Id of an action, -1 if the catalogue lacks it."""
+        words = np.zeros(self.mask.shape[1], np.uint64)
+        write_mask(mask, words)
+        found = (self.kind == kind) & (self.target == target) & (self.mask == words).all(axis=1)
+        return int(found.argmax()) if found.any() else -1
+
 
 @functools.cache
 def full_catalogue(grid: Grid) -> ActionCatalogue:
-    """Every topology action of ``grid``: do nothing, moves by substation, switches by line."""
+    """Every topology action of ``grid``: do nothing, moves by substation, switches by line.
+
+    Raises:
+        UsageError: they are more than :data:`LARGEST_CATALOGUE`.
+    """
+    size = full_size(grid.sub_info.tolist(), grid.n_line)
+    if size > LARGEST_CATALOGUE:
+        largest = int(grid.sub_info.argmax())
+        raise UsageError(
+            f"{grid.id} has more topology actions than the {LARGEST_CATALOGUE:,} that are enumerated (substation "
+            f"{largest} has {int(grid.sub_info[largest])} elements): take a limited_catalogue of it."
+        )
     subs = [_moves(n_elements) for n_elements in grid.sub_info.tolist()]
-    sizes = [len(masks) for masks in subs]
-    kind = np.repeat([_NOTHING, _MOVE, _SWITCH], [1, sum(sizes), grid.n_line]).astype(np.int8)
-    lines = np.arange(grid.n_line, dtype=np.int32)
-    target = np.concatenate(([0], np.repeat(np.arange(grid.n_sub), sizes), lines)).astype(np.int32)
-    mask = np.concatenate((np.zeros(1, np.uint32), *subs, np.zeros(grid.n_line, np.uint32)))
-    return _read_only(kind, target, mask)
+    return _catalogue(grid, np.repeat(np.arange(grid.n_sub), [len(masks) for masks in subs]), np.concatenate(subs))
+
+
+def full_size(sub_info: Iterable[int], n_line: int) -> int:
+    """Number of topology actions of a grid whose substations have ``sub_info`` elements."""
+    return 1 + sum((1 << n_elements - 1) - 1 for n_elements in sub_info) + n_line
+
+
+def limited_catalogue(grid: Grid, max_elements: int = 2, most: int = 10_000) -> ActionCatalogue:
+    """Topology actions of any ``grid``: do nothing, then the smallest moves, then the switch of every line.
+
+    Moving a set of elements and moving all others of the substation are the same; the size of a move is the number
+    of elements of the smaller of the two. Moves of one element come first, then those of two, and so on, within a
+    size by substation and then in lexicographic order of the smaller set; each is written as the set
+    without the substation's first element. With ``max_elements`` and ``most`` large enough these are the actions of
+    :func:`full_catalogue`, in another order.
+
+    Args:
+        grid: the grid.
+        max_elements: size of the largest moves.
+        most: actions at most; the moves that come last are left out.
+
+    Raises:
+        UsageError: ``max_elements`` below 1, or ``most`` has no room for do nothing and the switches.
+    """
+    if max_elements < 1:
+        raise UsageError(f"max_elements={max_elements} is not allowed: give at least 1.")
+    room = most - 1 - grid.n_line
+    if room < 0:
+        raise UsageError(f"most={most} is not allowed: {grid.id} has {1 + grid.n_line} actions without moves.")
+    moves = list(itertools.islice(_small_moves(grid, max_elements), room))
+    masks = np.zeros((len(moves), mask_words(grid)), np.uint64)
+    for row, (_, mask) in enumerate(moves):
+        write_mask(mask, masks[row])
+    return _catalogue(grid, np.array([sub for sub, _ in moves], np.int64), masks)
 
 
 def level_ids(grid: Grid, level: int) -> Ids:
@@ -123,23 +323,27 @@ def level_catalogue(grid: Grid, level: int) -> ActionCatalogue:
 
 @functools.cache
 def action_set_hash(grid: Grid, level: int) -> str:
-    """Short hash of the actions of a level and of their order."""
+    """Short hash of the actions of a level and of their order.
+
+    Masks count with 32 bits where no substation of the grid has more elements, else with all their words.
+    """
     actions = level_catalogue(grid, level)
     digest = hashlib.sha256(grid.id.encode())
     digest.update(actions.kind.astype("<i1").tobytes())
     digest.update(actions.target.astype("<i4").tobytes())
-    digest.update(actions.mask.astype("<u4").tobytes())
+    short = grid.sub_info.max() <= _SHORT_HASH_ELEMENTS
+    digest.update((actions.mask[:, 0].astype("<u4") if short else actions.mask.astype("<u8")).tobytes())
     return digest.hexdigest()[:16]
 
 
 @jit
 def is_legal(state: GridState, i: int, kind: int, target: int) -> bool:
-    """Whether the rules let environment ``i`` play a topology action now.
+    """Whether the rules let environment ``i`` play an action of one change now.
 
     A line or substation may be acted on when its cooldown, as last observed, is over (Grid2Op's
-    ``DefaultRules``; one action of a catalogue never exceeds the limits on simultaneous changes).
-    Elements behind an open line may be moved: nothing happens to them, and the substation is what
-    counts.
+    ``DefaultRules``). One change never exceeds the limits on simultaneous changes; for several see
+    :func:`rl2grid.mdp.legality.judge`. Elements behind an open line may be moved: nothing happens to them, and the
+    substation is what counts.
     """
     if kind in (_MOVE, _RESTORE):
         return bool(state.time_before_cooldown_sub[i, target] == 0)
@@ -163,20 +367,10 @@ def moved_elements(grid: Grid, sub: int, mask: int) -> Ids:
 
 def describe(grid: Grid, action: StepAction) -> str:
     """The action in words, for people."""
-    kind, target = ActionKind(action.kind), action.target
-    if kind == ActionKind.NOTHING:
-        return "do nothing"
-    if kind == ActionKind.SWITCH:
-        return f"switch line {target} ({grid.name_line[target]})"
-    if kind == ActionKind.RECONNECT:
-        return f"reconnect line {target} ({grid.name_line[target]})"
-    if kind == ActionKind.RESTORE:
-        return f"substation {target}: move everything back to busbar 1"
-    if kind == ActionKind.MOVE:
-        elements = _in_words(grid, moved_elements(grid, target, action.mask))
-        return f"substation {target}: move {elements} to the other busbar"
-    assert action.values is not None
-    return _injection_in_words(grid, action.values)
+    parts = [_change_in_words(grid, change) for change in action.changes]
+    if action.values is not None:
+        parts += _injection_in_words(grid, action.values)
+    return "; ".join(parts) if parts else "do nothing"
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,22 +466,59 @@ def validate_continuous(grid: Grid, action: ArrayLike) -> F32:
 
 
 def _moves(n_elements: int) -> Masks:
-    """Masks of every move of a substation, in Grid2Op's order.
+    """Masks of every move of a substation, uint64 [move, 1], in Grid2Op's order.
 
     That is the lexicographic order of the vectors of moved elements with the first element fixed:
     the number of an action, read in binary, is the vector with the last element as lowest bit.
     """
-    number = np.arange(1, 1 << (n_elements - 1), dtype=np.uint32)
+    number = np.arange(1, 1 << (n_elements - 1), dtype=np.uint64)
     mask = np.zeros_like(number)
     for k in range(1, n_elements):
-        mask |= (number >> np.uint32(n_elements - 1 - k) & np.uint32(1)) << np.uint32(k)
-    return mask
+        mask |= (number >> np.uint64(n_elements - 1 - k) & np.uint64(1)) << np.uint64(k)
+    return mask[:, np.newaxis]
+
+
+def _small_moves(grid: Grid, max_elements: int) -> Iterator[tuple[int, int]]:
+    """Substation and mask of every move of at most that many elements, in the order of a limited catalogue."""
+    sizes = grid.sub_info.tolist()
+    for size in range(1, min(max_elements, max(sizes) // 2) + 1):
+        for sub, n_elements in enumerate(sizes):
+            if 2 * size > n_elements:
+                continue
+            everything = (1 << n_elements) - 1
+            for elements in itertools.combinations(range(n_elements), size):
+                mask = sum(1 << k for k in elements)
+                if not mask & 1:
+                    yield sub, mask
+                elif 2 * size < n_elements:  # else the other half comes as a set of its own
+                    yield sub, everything ^ mask
+
+
+def _catalogue(grid: Grid, subs: NDArray[np.int64], masks: Masks) -> ActionCatalogue:
+    """Do nothing, the moves ``masks`` [move, word] of ``subs`` [move], and the switch of every line."""
+    kind = np.repeat([_NOTHING, _MOVE, _SWITCH], [1, len(subs), grid.n_line]).astype(np.int8)
+    target = np.concatenate(([0], subs, np.arange(grid.n_line))).astype(np.int32)
+    mask = np.zeros((len(kind), masks.shape[1]), np.uint64)
+    mask[1 : 1 + len(subs)] = masks
+    return _read_only(kind, target, mask)
 
 
 def _read_only(kind: Kinds, target: Ids, mask: Masks) -> ActionCatalogue:
     for array in (kind, target, mask):
         array.setflags(write=False)
     return ActionCatalogue(kind, target, mask)
+
+
+def _change_in_words(grid: Grid, change: Change) -> str:
+    kind, target, mask = change
+    if kind == _SWITCH:
+        return f"switch line {target} ({grid.name_line[target]})"
+    if kind == _RECONNECT:
+        return f"reconnect line {target} ({grid.name_line[target]})"
+    if kind == _RESTORE:
+        return f"substation {target}: move everything back to busbar 1"
+    elements = _in_words(grid, moved_elements(grid, target, mask))
+    return f"substation {target}: move {elements} to the other busbar"
 
 
 def _in_words(grid: Grid, elements: Ids) -> str:
@@ -303,7 +534,7 @@ def _in_words(grid: Grid, elements: Ids) -> str:
         _numbered("load", np.flatnonzero(np.isin(grid.load_pos_topo_vect, elements)).tolist()),
         _numbered("storage", np.flatnonzero(np.isin(grid.storage_pos_topo_vect, elements)).tolist()),
     ]
-    first, *others = [group for group in groups if group]
+    first, *others = [group for group in groups if group] or ["nothing"]
     return f"{first} with {_listed(others)}" if others else first
 
 
@@ -317,9 +548,9 @@ def _listed(words: list[str]) -> str:
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
 
 
-def _injection_in_words(grid: Grid, values: F32) -> str:
+def _injection_in_words(grid: Grid, values: F32) -> list[str]:
     injection = decode_continuous(grid, values)
-    parts = [
+    return [
         *(f"redispatch {grid.name_gen[gen]} by {injection.redispatch[gen]:+.1f} MW"
           for gen in np.flatnonzero(injection.redispatch)),
         *(f"limit {grid.name_gen[gen]} to {100 * injection.curtailment_limit[gen]:.0f}% of its maximum"
@@ -327,4 +558,3 @@ def _injection_in_words(grid: Grid, values: F32) -> str:
         *(f"{'charge' if power > 0 else 'discharge'} {name} with {abs(power):.1f} MW"
           for name, power in zip(grid.name_storage, injection.storage, strict=True) if power),
     ]  # fmt: skip
-    return "; ".join(parts) if parts else "do nothing"

@@ -49,6 +49,8 @@ class GridState(NamedTuple):
     sub_first_element: Annotated[I32, constant("sub", "entry of its first element in topo_vect")]
     sub_info: Annotated[I32, constant("sub", "number of its elements")]
     slack_gen: Annotated[I32, constant("1", "generator that balances the flow")]
+    sub_area: Annotated[I32, constant("sub", "area within which changes are limited; a line is of its origin's")]
+    max_changes: Annotated[I32, constant("2", "lines and substations of an area that one action may change")]
 
     # What Grid2Op observes after a step (its observation's attributes).
     gen_p: Annotated[F32, row("gen", "production", "MW", blank=0)]
@@ -114,6 +116,10 @@ OBSERVED_STORAGE = tuple(name for name in _OBSERVED if name.startswith("storage_
 
 def new_state(grid: Grid, n: int) -> GridState:
     """A blank state for ``n`` environments of ``grid``; the constants are shared, not copied."""
-    constants = {name: getattr(grid, name) for name in fields_of(GridState, Role.CONSTANT) if name != "slack_gen"}
+    own = {
+        "slack_gen": np.array([grid.slack_gen], np.int32),
+        "max_changes": np.array([grid.rules.max_line_changes, grid.rules.max_sub_changes], np.int32),
+    }
+    shared = {name: getattr(grid, name) for name in fields_of(GridState, Role.CONSTANT) if name not in own}
     sizes = axis_sizes(grid) | {"component": 3, "cost": 2, "score": 3}
-    return allocate(GridState, sizes, n, slack_gen=np.array([grid.slack_gen], np.int32), **constants)
+    return allocate(GridState, sizes, n, **own, **shared)

@@ -12,7 +12,7 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from rl2grid.arrays import F32, I8, I32, U32, Flags, Index
+from rl2grid.arrays import F32, I8, I32, U64, Flags, Index
 from rl2grid.compile import borrowing_jit
 from rl2grid.grids import Grid
 from rl2grid.grids.axes import axis_sizes
@@ -43,6 +43,7 @@ from rl2grid.powerflow.lane_moves import (
     GENERATOR,
     GENERATORS,
     HAS_SHUNT,
+    LARGEST_SITE,
     LINES,
     LOAD,
     LOADS,
@@ -72,6 +73,7 @@ SOLVED, LOAD_CUT_OFF, GENERATOR_CUT_OFF, STORAGE_CUT_OFF, ISLAND, NO_SOLUTION = 
 """Verdicts, numbered and ordered as the reasons of a game over (``rl2grid.mdp.termination.GameOver``)."""
 _SETPOINT_TOLERANCE = 1e-7
 """Per unit, as in :mod:`rl2grid.powerflow.ac`."""
+_WORD_BITS = 64
 _BASE: Any = np.int64(0)
 _ALONE: Any = np.int64(1)
 """Rows of a batch's flow: the base case; one change after another, solved cold."""
@@ -96,7 +98,7 @@ class Changes(NamedTuple):
 
     kind: Annotated[I8, constant("change", "NOTHING, MOVE or SWITCH")]
     target: Annotated[I32, constant("change", "substation or line")]
-    mask: Annotated[U32, constant("change", "MOVE: bit k is the k-th element of the substation")]
+    mask: Annotated[U64, constant("change word", "MOVE: bit k is the k-th element of the substation")]
 
 
 class ChangeOutcomes(NamedTuple):
@@ -175,11 +177,11 @@ def _new_batch(grid: Grid, network: Network, wiring: Wiring, snapshot: Snapshot)
         new_flow_state(network, 2),
         new_paths(n_bus, 2 * n_bus),
         new_lane_flow(n_bus, grid.n_line),
-        new_site(n_bus, int(grid.sub_info.max())),
+        new_site(n_bus, min(int(grid.sub_info.max()), LARGEST_SITE)),
         new_switches(n_bus),
         allocate(Scratch, sizes),
         snapshot,
-        allocate(Changes, {"change": 0}),
+        allocate(Changes, {"change": 0, "word": 1}),
         new_outcomes(0, np.zeros((0, 0), np.float32)),
     )
 
@@ -344,12 +346,10 @@ def _write_topology(batch: Batch, change: Index) -> None:
         topo_vect[element] = snapshot.topo_vect[element]
     if kind == MOVE:
         first = batch.wiring.sub_first_element[target]
-        mask = changes.mask[change]
-        k = 0
-        while mask >> np.uint32(k) != 0:
-            if (mask >> np.uint32(k)) & np.uint32(1) and topo_vect[first + k] > 0:
+        for k in range(batch.wiring.sub_info[target]):
+            moved = (changes.mask[change, k // _WORD_BITS] >> np.uint64(k % _WORD_BITS)) & np.uint64(1) != 0
+            if moved and topo_vect[first + k] > 0:
                 topo_vect[first + k] = 3 - topo_vect[first + k]
-            k += 1
     elif kind == SWITCH:
         origin, extremity = network.line_or_position[target], network.line_ex_position[target]
         if topo_vect[origin] > 0 or topo_vect[extremity] > 0:
@@ -508,7 +508,7 @@ def _solve_moves(batch: Batch, equations: Equations, factors: Factors, order: I3
     network, wiring, flow, changes, snapshot = batch.network, batch.wiring, batch.flow, batch.changes, batch.snapshot
     lane_flow, site, paths, outcomes = batch.lane_flow, batch.site, batch.paths, batch.outcomes
     sub = changes.target[order[0]]
-    solvable = open_site(
+    solvable = wiring.sub_info[sub] <= LARGEST_SITE and open_site(
         network, wiring, flow, _BASE, equations, factors, paths, lane_flow, site, sub, snapshot.topo_vect,
         snapshot.gen_p, snapshot.gen_v, snapshot.load_p, snapshot.load_q, snapshot.storage_p,
     )  # fmt: skip
@@ -518,7 +518,7 @@ def _solve_moves(batch: Batch, equations: Equations, factors: Factors, order: I3
         if not solvable:
             _solve_alone(batch, change)
             continue
-        second = (site.members[SECOND] ^ changes.mask[change]) & site.members[CONNECTED]
+        second = (site.members[SECOND] ^ np.uint32(changes.mask[change, 0])) & site.members[CONNECTED]
         verdict = _verdict_of_move(site, second)
         if verdict != SOLVED:
             outcomes.cold[change] = False

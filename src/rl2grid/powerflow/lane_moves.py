@@ -35,6 +35,8 @@ from rl2grid.powerflow.newton import fill_jacobian
 from rl2grid.powerflow.paths import Paths, solve_backward, solve_forward, write_path, write_path_product
 from rl2grid.structures import allocate, constant, workspace
 
+LARGEST_SITE = 32
+"""Elements of a substation whose moves are solved in lanes; those of a larger one are solved one by one."""
 ORIGIN, EXTREMITY, GENERATOR, LOAD, STORAGE = range(5)
 """Kinds of elements."""
 N_LINES, N_ELEMENTS, IS_SLACK, HAS_SHUNT, N_PARTS = range(5)

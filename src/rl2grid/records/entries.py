@@ -79,8 +79,8 @@ def facts_of(episode: Episode) -> dict[str, Any]:
 def episode_hash(facts: Mapping[str, Any], foresight: int = 0) -> str:
     """Short hash of what happened in an episode, to the last bit of every number.
 
-    The sums and means over its grid steps are among the facts, so that any difference on the way shows. Foresight counts
-    where there is some.
+    The sums and means over its grid steps are among the facts, so that any difference on the way shows. Foresight
+    counts where there is some.
     """
     values = [float(facts[name]) if kind is float else facts[name] for name, kind, *_ in FACTS]
     if foresight:

@@ -6,21 +6,20 @@ from typing import Annotated, NamedTuple
 
 from rl2grid.arrays import F32, I32, Flags
 from rl2grid.compile import jit
+from rl2grid.engines.native.orders import Orders
 from rl2grid.grids import Grid
 from rl2grid.grids.axes import axis_sizes
-from rl2grid.mdp.actions import ActionKind
+from rl2grid.mdp.legality import Verdict
 from rl2grid.mdp.state import GridState
 from rl2grid.structures import allocate, row
-
-_MOVE, _SWITCH = int(ActionKind.MOVE), int(ActionKind.SWITCH)
 
 
 class ActionNotes(NamedTuple):
     """Structure of arrays of ``n`` environments, right after the agent's own step."""
 
-    cooldown_left: Annotated[
-        I32, row("", "that the line or substation of a topology action still cooled down before it", "steps")
-    ]
+    verdict: Annotated[I32, row("", "what the rules said, `rl2grid.mdp.legality.LEGAL` or why it was not played")]
+    verdict_target: Annotated[I32, row("", "the line or substation that cooled down, else -1")]
+    verdict_left: Annotated[I32, row("", "that it still cooled down before the action", "steps")]
     terminated: Annotated[Flags, row("", "game over")]
     illegal: Annotated[Flags, row("", "the action broke a rule")]
     ambiguous: Annotated[Flags, row("", "the action had no single meaning")]
@@ -39,19 +38,17 @@ def copy_notes(notes: ActionNotes) -> ActionNotes:
     return ActionNotes._make(array.copy() for array in notes)
 
 
-@jit
-def note_before(notes: ActionNotes, state: GridState, i: int, kind: int, target: int) -> None:
-    """Note, before the agent's step, what would refuse its action."""
-    notes.cooldown_left[i] = 0
-    if kind == _MOVE:
-        notes.cooldown_left[i] = state.time_before_cooldown_sub[i, target]
-    elif kind == _SWITCH:
-        notes.cooldown_left[i] = state.time_before_cooldown_line[i, target]
+def verdict_in(notes: ActionNotes, i: int) -> Verdict:
+    """What the rules said of the action of row ``i``."""
+    return Verdict(int(notes.verdict[i]), int(notes.verdict_target[i]), int(notes.verdict_left[i]))
 
 
 @jit
-def note_after(notes: ActionNotes, state: GridState, i: int) -> None:
+def note_action(notes: ActionNotes, orders: Orders, state: GridState, i: int) -> None:
     """Note, right after the agent's step, what became of its action."""
+    notes.verdict[i] = orders.verdict[i]
+    notes.verdict_target[i] = orders.verdict_target[i]
+    notes.verdict_left[i] = orders.verdict_left[i]
     notes.terminated[i] = state.terminated[i]
     notes.illegal[i] = state.illegal[i]
     notes.ambiguous[i] = state.ambiguous[i]

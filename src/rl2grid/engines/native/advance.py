@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from rl2grid.arrays import F32
 from rl2grid.compile import jit
-from rl2grid.engines.native.action_notes import note_after, note_before
+from rl2grid.engines.native.action_notes import note_action
 from rl2grid.engines.native.environments import Environments, open_environments
+from rl2grid.engines.native.orders import Orders, order_one_change
 from rl2grid.engines.native.step import begin_step, dispatch_or_lose, finish_step, reset_row
 from rl2grid.mdp.accumulate import accrue, begin_episode, begin_transition
 from rl2grid.mdp.actions import ActionKind
@@ -19,9 +20,6 @@ from rl2grid.mdp.features import write_redispatch_observation, write_topology_ob
 from rl2grid.mdp.heuristics import is_safe, reconnect_action, recovery_action
 from rl2grid.mdp.rewards import default_components, paper_components, released_components
 from rl2grid.mdp.state import GridState
-
-RESET = -1
-"""In place of an :class:`~rl2grid.mdp.actions.ActionKind`: show the first row of the episode."""
 
 ALONE, IDLE, RECOVERY, RECONNECT = range(4)
 """Who plays between two decisions: nobody, or a heuristic (recovery only reconnects on continuous tasks)."""
@@ -38,9 +36,12 @@ Components = tuple[float, float, float]
 def advance(
     address: int,
     rows: NDArray[np.int64],
+    begins: bool,
+    first: NDArray[np.int64],
     kinds: NDArray[np.int64],
     targets: NDArray[np.int64],
-    masks: NDArray[np.int64],
+    masks: NDArray[np.uint64],
+    injects: NDArray[np.bool_],
     values: F32,
     heuristic: int,
     reward: int,
@@ -52,37 +53,70 @@ def advance(
     Args:
         address: of the handle to the :class:`~rl2grid.engines.native.environments.Environments`.
         rows: environments, int64 [k].
-        kinds: what each agent does, an :class:`~rl2grid.mdp.actions.ActionKind` or :data:`RESET`, int64 [k].
-        targets: lines or substations, int64 [k].
-        masks: moved elements, int64 [k].
-        values: continuous actions, float32 [k, continuous].
+        begins: show the first row of the episodes; nobody acts.
+        first: where the changes of each agent's action begin, and where the last one's end, int64 [k + 1].
+        kinds: what each change does, an :class:`~rl2grid.mdp.actions.ActionKind`, int64 [change].
+        targets: lines or substations, int64 [change].
+        masks: moved elements, uint64 [change, word].
+        injects: which agents inject, bool [k].
+        values: their injections, float32 [k, continuous].
         heuristic: who plays until the next decision.
         reward: which reward.
         weights: of its components.
         gamma: discount between grid steps.
     """
     environments = open_environments(address)
-    state, notes = environments.state, environments.notes
+    state, orders = environments.state, environments.orders
     for k in range(rows.shape[0]):
         i = rows[k]
         illegal, ambiguous = False, False
-        if kinds[k] == RESET:
+        if begins:
             reset_row(environments, i)
             begin_episode(state, i)
         else:
             if state.decisions[i] > 0:
                 begin_transition(state, i)
             state.decisions[i] += 1
-            note_before(notes, state, i, kinds[k], targets[k])
-            _step(environments, i, kinds[k], targets[k], masks[k], values[k], reward, weights, gamma)
-            note_after(notes, state, i)
+            _order(orders, i, k, first, kinds, targets, masks, injects, values)
+            _step(environments, i, reward, weights, gamma)
+            note_action(environments.notes, orders, state, i)
             illegal, ambiguous = state.illegal[i], state.ambiguous[i]
         if heuristic == ALONE:
             continue
         while not (state.terminated[i] or state.truncated[i]) and is_safe(state, i):
             kind, target = _heuristic_action(state, i, heuristic)
-            _step(environments, i, kind, target, 0, values[k], reward, weights, gamma)
+            order_one_change(orders, i, kind, target)
+            _step(environments, i, reward, weights, gamma)
         state.illegal[i], state.ambiguous[i] = illegal, ambiguous
+
+
+@jit
+def _order(
+    orders: Orders,
+    i: int,
+    k: int,
+    first: NDArray[np.int64],
+    kinds: NDArray[np.int64],
+    targets: NDArray[np.int64],
+    masks: NDArray[np.uint64],
+    injects: NDArray[np.bool_],
+    values: F32,
+) -> None:
+    """Note entry ``k`` of the agents' actions as what row ``i`` is to play."""
+    count = 0
+    for change in range(first[k], first[k + 1]):
+        if kinds[change] == _NOTHING:
+            continue
+        orders.kind[i, count] = kinds[change]
+        orders.target[i, count] = targets[change]
+        for word in range(masks.shape[1]):
+            orders.mask[i, count, word] = masks[change, word]
+        count += 1
+    orders.n_changes[i] = count
+    orders.injects[i] = injects[k]
+    if injects[k]:
+        for entry in range(values.shape[1]):
+            orders.injection[i, entry] = values[k, entry]
 
 
 @jit
@@ -95,20 +129,10 @@ def _heuristic_action(state: GridState, i: int, heuristic: int) -> tuple[int, in
 
 
 @jit
-def _step(
-    environments: Environments,
-    i: int,
-    kind: int,
-    target: int,
-    mask: int,
-    values: F32,
-    reward: int,
-    weights: Components,
-    gamma: float,
-) -> None:
+def _step(environments: Environments, i: int, reward: int, weights: Components, gamma: float) -> None:
     """One grid step and what it is worth."""
     state = environments.state
-    needed = begin_step(environments, i, kind, target, mask, values, True)
+    needed = begin_step(environments, i, True)
     if not needed or dispatch_or_lose(environments, i):
         finish_step(environments, i)
     survive, overload, cost = _components(state, i, reward)

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from rl2grid.arrays import F32
 from rl2grid.engines import DISPATCHES
 from rl2grid.engines.native.entry import (
     begin_one,
@@ -23,6 +22,7 @@ from rl2grid.engines.native.entry import (
 from rl2grid.engines.native.environments import Environments, new_environments
 from rl2grid.engines.native.hidden_state import new_hidden_state
 from rl2grid.engines.native.imagination import imagined_rows, outlook_of
+from rl2grid.engines.native.orders import write_order
 from rl2grid.engines.native.playing import Playing, playing_named, playing_scenario
 from rl2grid.engines.native.series import outages_of
 from rl2grid.engines.native.worlds import RowLayout, restore_row, save_row
@@ -30,7 +30,7 @@ from rl2grid.engines.worlds import Home, SeriesName, World, grid_fingerprint
 from rl2grid.errors import UsageError, one_of
 from rl2grid.grids import Grid
 from rl2grid.handles import Handle
-from rl2grid.mdp.actions import DO_NOTHING, ActionKind, StepAction
+from rl2grid.mdp.actions import DO_NOTHING, StepAction, check_changes
 from rl2grid.mdp.opponents import OpponentDraws, draw_opponent, load_draws
 from rl2grid.mdp.state import GridState
 from rl2grid.mdp.termination import GameOver
@@ -40,8 +40,6 @@ from rl2grid.scenarios.library import load_scenario
 from rl2grid.scenarios.scenario import Scenario
 from rl2grid.streams import Purpose, Stream
 from rl2grid.structures import with_own_workspace
-
-_NO_VALUES = np.zeros(0, np.float32)
 
 
 class NativeEngine:
@@ -135,11 +133,12 @@ class NativeEngine:
 
     def step(self, i: int, action: StepAction) -> None:
         """Play one grid step of environment ``i``."""
-        command = _command(action)
+        check_changes(self.grid, action.changes)
+        write_order(self.environments.orders, i, action)
         if self.dispatch == "exact":
-            step_one(self.address, i, *command)
+            step_one(self.address, i)
             return
-        if begin_one(self.address, i, *command, False) and not self._dispatch_like_grid2op(self.environments, i):
+        if begin_one(self.address, i, False) and not self._dispatch_like_grid2op(self.environments, i):
             lose_one(self.address, i)
             return
         finish_one(self.address, i)
@@ -287,9 +286,11 @@ class NativeEngine:
             raise UsageError("Nothing can be simulated after a game over: reset the environment first.")
         if horizon > self.environments.hidden.horizons[i]:
             raise UsageError(f"Scenario {playing.name.scenario_id!r} has no forecast {horizon} steps ahead.")
+        check_changes(self.grid, action.changes)
         self._copy_row(i)
+        write_order(self._simulated.structure.orders, 0, action)
         exact, simulated, real = self.dispatch == "exact", self._simulated.address, self.address
-        needed = begin_simulation_one(simulated, real, i, *_command(action), horizon, exact)
+        needed = begin_simulation_one(simulated, real, i, horizon, exact)
         return not needed or self._find_simulated_dispatch()
 
     def _copy_row(self, i: int) -> None:
@@ -324,15 +325,6 @@ class NativeEngine:
             float(hidden.storage_change[i]) - float(hidden.curtailment_change[i]),
             state.actual_dispatch[i],
         )
-
-
-def _command(action: StepAction) -> tuple[int, int, int, F32]:
-    values = action.values
-    if values is None:
-        # INJECTION without values asks for nothing.
-        kind = int(ActionKind.NOTHING) if action.kind == ActionKind.INJECTION else action.kind
-        return kind, action.target, action.mask, _NO_VALUES
-    return action.kind, action.target, action.mask, values
 
 
 def _rebuild(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from rl2grid.arrays import F32
 from rl2grid.compile import jit
 from rl2grid.engines.native.environments import open_environments
 from rl2grid.engines.native.generation import set_generators
@@ -18,9 +17,9 @@ def reset_one(address: int, i: int) -> None:
 
 
 @jit
-def begin_one(address: int, i: int, kind: int, target: int, mask: int, values: F32, refuse_impossible: bool) -> bool:
+def begin_one(address: int, i: int, refuse_impossible: bool) -> bool:
     """The step of environment ``i`` up to the redispatch; whether generators have to be dispatched."""
-    return begin_step(open_environments(address), i, kind, target, mask, values, refuse_impossible)
+    return begin_step(open_environments(address), i, refuse_impossible)
 
 
 @jit
@@ -36,30 +35,18 @@ def lose_one(address: int, i: int) -> None:
 
 
 @jit
-def step_one(address: int, i: int, kind: int, target: int, mask: int, values: F32) -> None:
+def step_one(address: int, i: int) -> None:
     """A whole step of environment ``i`` with exact dispatch."""
     environments = open_environments(address)
-    if begin_step(environments, i, kind, target, mask, values, True) and not dispatch_or_lose(environments, i):
+    if begin_step(environments, i, True) and not dispatch_or_lose(environments, i):
         return
     finish_step(environments, i)
 
 
 @jit
-def begin_simulation_one(
-    address: int,
-    real: int,
-    row: int,
-    kind: int,
-    target: int,
-    mask: int,
-    values: F32,
-    horizon: int,
-    refuse_impossible: bool,
-) -> bool:
+def begin_simulation_one(address: int, real: int, row: int, horizon: int, refuse_impossible: bool) -> bool:
     """The simulated step up to the redispatch; ``real`` is the address of the engine's own environments."""
-    return begin_simulation(
-        open_environments(address), open_environments(real), row, kind, target, mask, values, horizon, refuse_impossible
-    )
+    return begin_simulation(open_environments(address), open_environments(real), row, horizon, refuse_impossible)
 
 
 @jit

@@ -8,6 +8,7 @@ from typing import NamedTuple
 from rl2grid.engines.native.action_notes import ActionNotes, new_action_notes
 from rl2grid.engines.native.constants import GridConstants, new_constants
 from rl2grid.engines.native.hidden_state import HiddenState, new_hidden_state
+from rl2grid.engines.native.orders import Orders, new_orders
 from rl2grid.grids import Grid, OpponentConfig
 from rl2grid.handles import opener
 from rl2grid.mdp.opponents import OpponentState, new_opponent_state
@@ -29,6 +30,7 @@ class Environments(NamedTuple):
     hidden: HiddenState
     flow: FlowState
     opponent: OpponentState
+    orders: Orders
     notes: ActionNotes
 
 
@@ -42,6 +44,7 @@ def new_environments(grid: Grid, network: Network, n: int, opponent: bool, outag
         new_hidden_state(grid, n, outages),
         new_flow_state(network, n),
         new_opponent_state(attacked, n),
+        new_orders(grid, n),
         new_action_notes(grid, n),
     )
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from rl2grid.arrays import F32
 from rl2grid.compile import jit
 from rl2grid.engines.dispatch import (
     NEGLIGIBLE,
@@ -41,12 +40,13 @@ def begin_generation(environments: Environments, i: int) -> None:
 
 
 @jit
-def decode_injection(environments: Environments, i: int, values: F32) -> None:
-    """Write what a continuous action asks for: redispatch, curtailment limits, storage.
+def decode_injection(environments: Environments, i: int) -> None:
+    """Write what the injection asks for: redispatch, curtailment limits, storage.
 
     :func:`rl2grid.mdp.actions.decode_continuous`, compiled; limits go into effect at once.
     """
     constants, state, hidden = environments.constants, environments.state, environments.hidden
+    values = environments.orders.injection[i]
     entry = 0
     for gen in constants.redispatch_gen:
         ramp = state.gen_max_ramp_up[gen] if values[entry] > 0 else state.gen_max_ramp_down[gen]
@@ -62,9 +62,10 @@ def decode_injection(environments: Environments, i: int, values: F32) -> None:
 
 
 @jit
-def request_is_impossible(environments: Environments, i: int, values: F32) -> bool:
-    """Whether the redispatch of a continuous action can never be carried out; writes ``request``."""
+def request_is_impossible(environments: Environments, i: int) -> bool:
+    """Whether the redispatch of the injection can never be carried out; writes ``request``."""
     constants, state, hidden = environments.constants, environments.state, environments.hidden
+    values = environments.orders.injection[i]
     hidden.request[i] = 0.0
     for entry in range(constants.redispatch_gen.shape[0]):
         gen = constants.redispatch_gen[entry]

@@ -49,8 +49,8 @@ class HiddenState(NamedTuple):
     charge_before: Annotated[
         F32, scratch("storage", "charge before the step", "MWh", grid2op="_storage_previous_charge")
     ]
-    changed_line: Annotated[I32, scratch("", "line that the agent's action touches, -1 if none")]
-    changed_sub: Annotated[I32, scratch("", "substation that it touches, -1 if none")]
+    touched_line: Annotated[Flags, scratch("line", "touched by the action played, cools down afterwards")]
+    touched_sub: Annotated[Flags, scratch("sub", "touched by the action played, cools down afterwards")]
     tripped: Annotated[Flags, scratch("line", "opened by a protection in this step")]
     counted: Annotated[Flags, scratch("line", "overload counted in this step")]
     running_count: Annotated[I32, scratch("line", "protection counters during the cascade")]

@@ -4,47 +4,32 @@ from __future__ import annotations
 
 import numpy as np
 
-from rl2grid.arrays import F32
 from rl2grid.compile import jit
 from rl2grid.engines.native.environments import Environments
-from rl2grid.engines.native.generation import decode_injection, request_is_impossible, set_generators
+from rl2grid.engines.native.generation import set_generators
 from rl2grid.engines.native.series import read_forecast
-from rl2grid.engines.native.step import nobody_injects, prepare_dispatch, run_and_register
-from rl2grid.engines.native.topology import act_on_topology, open_line
-from rl2grid.mdp.actions import ActionKind
+from rl2grid.engines.native.step import play_order, prepare_dispatch, run_and_register
+from rl2grid.engines.native.topology import judge_order, open_line
+from rl2grid.mdp.state import GridState
 
-_INJECTION = int(ActionKind.INJECTION)
 _FULL_LOAD = np.float32(1.0)
 
 
 @jit
 def begin_simulation(
-    environments: Environments,
-    real: Environments,
-    row: int,
-    kind: int,
-    target: int,
-    mask: int,
-    values: F32,
-    horizon: int,
-    refuse_impossible: bool,
+    environments: Environments, real: Environments, row: int, horizon: int, refuse_impossible: bool
 ) -> bool:
     """Play a simulated step in row 0 up to the redispatch; whether generators have to be dispatched.
 
-    Row 0 of ``environments`` is a copy of row ``row`` of the ``real`` ones. Maintenance comes before the agent's
-    action here, and is not forced upon it.
+    Row 0 of ``environments`` is a copy of row ``row`` of the ``real`` ones, with the action to be played.
+    Maintenance comes before the agent's action here, and is not forced upon it.
     """
     state = environments.state
     now = state.step[0]
-    _skip_to(environments, horizon)
-    act_on_topology(environments, 0, kind, target, mask)
-    injects = kind == _INJECTION
-    if injects and refuse_impossible and request_is_impossible(environments, 0, values):
-        state.illegal[0] = True
-        injects = False
-    nobody_injects(environments.hidden, 0)
-    if injects:
-        decode_injection(environments, 0, values)
+    _skip_counters_to(environments, horizon)
+    is_legal = judge_order(environments, 0)  # of the topology observed
+    _skip_maintenance_to(state, horizon)
+    play_order(environments, 0, is_legal, refuse_impossible)
     read_forecast(environments, 0, real.hidden, row, now, horizon)
     state.step[0] = now + horizon
     return prepare_dispatch(environments, 0)
@@ -58,7 +43,7 @@ def finish_simulation(environments: Environments) -> None:
 
 
 @jit
-def _skip_to(environments: Environments, horizon: int) -> None:
+def _skip_counters_to(environments: Environments, horizon: int) -> None:
     """Counters of row 0 as Grid2Op sets them for a step ``horizon`` steps ahead."""
     state, hidden = environments.state, environments.hidden
     for line in range(state.rho.shape[1]):
@@ -66,6 +51,14 @@ def _skip_to(environments: Environments, horizon: int) -> None:
         if state.rho[0, line] > _FULL_LOAD:
             state.timestep_overflow[0, line] += horizon - 1
             hidden.protection[0, line] += horizon - 1
+    for sub in range(state.time_before_cooldown_sub.shape[1]):
+        state.time_before_cooldown_sub[0, sub] = max(state.time_before_cooldown_sub[0, sub] - (horizon - 1), 0)
+
+
+@jit
+def _skip_maintenance_to(state: GridState, horizon: int) -> None:
+    """Planned outages of row 0 as they are ``horizon`` steps ahead; opens the lines that are out then."""
+    for line in range(state.rho.shape[1]):
         begin, duration = state.time_next_maintenance[0, line], state.duration_next_maintenance[0, line]
         if begin == -1:
             continue
@@ -78,5 +71,3 @@ def _skip_to(environments: Environments, horizon: int) -> None:
             state.time_next_maintenance[0, line] = 0
             state.duration_next_maintenance[0, line] = duration - (horizon - begin)
             open_line(state, 0, line)
-    for sub in range(state.time_before_cooldown_sub.shape[1]):
-        state.time_before_cooldown_sub[0, sub] = max(state.time_before_cooldown_sub[0, sub] - (horizon - 1), 0)

@@ -7,7 +7,6 @@
 
 from __future__ import annotations
 
-from rl2grid.arrays import F32
 from rl2grid.compile import jit
 from rl2grid.engines.native.environments import Environments
 from rl2grid.engines.native.generation import (
@@ -27,15 +26,13 @@ from rl2grid.engines.native.hidden_state import HiddenState
 from rl2grid.engines.native.observation import observe
 from rl2grid.engines.native.protections import flow_with_cascade
 from rl2grid.engines.native.series import begin_outages, plan_outages, read_row
-from rl2grid.engines.native.topology import act_on_topology, open_line, remember_busbars
-from rl2grid.mdp.actions import ActionKind
+from rl2grid.engines.native.topology import judge_order, merge_topology, open_line, remember_busbars, touch_nothing
 from rl2grid.mdp.opponents import opponent_step
 from rl2grid.mdp.state import GridState
 from rl2grid.mdp.termination import GameOver, game_over_reason
 from rl2grid.powerflow.ac import forget_flow
 from rl2grid.structures import blank_row
 
-_INJECTION = int(ActionKind.INJECTION)
 _DISPATCH = int(GameOver.DISPATCH)
 
 
@@ -70,33 +67,35 @@ def reset_row(environments: Environments, i: int) -> None:
 
 
 @jit
-def begin_step(
-    environments: Environments, i: int, kind: int, target: int, mask: int, values: F32, refuse_impossible: bool
-) -> bool:
+def begin_step(environments: Environments, i: int, refuse_impossible: bool) -> bool:
     """Play the step of environment ``i`` up to the redispatch; whether generators have to be dispatched.
 
     Args:
-        environments: row ``i`` holds the last observation and what the last step left.
+        environments: row ``i`` holds the last observation, what the last step left, and the action to be played.
         i: the row.
-        kind: an :class:`~rl2grid.mdp.actions.ActionKind`.
-        target: line or substation.
-        mask: moved elements.
-        values: float32 [continuous], read if ``kind`` is INJECTION.
         refuse_impossible: make an action do nothing whose redispatch can never be carried out.
     """
-    state, hidden = environments.state, environments.hidden
+    state = environments.state
     state.step[i] += 1
-    act_on_topology(environments, i, kind, target, mask)
-    injects = kind == _INJECTION
-    if injects and refuse_impossible and request_is_impossible(environments, i, values):
-        state.illegal[i] = True
-        injects = False
-    nobody_injects(hidden, i)
-    if injects:
-        decode_injection(environments, i, values)
+    play_order(environments, i, judge_order(environments, i), refuse_impossible)
     read_row(environments, i, state.step[i])
     plan_outages(environments, i, state.step[i])
     return prepare_dispatch(environments, i)
+
+
+@jit
+def play_order(environments: Environments, i: int, is_legal: bool, refuse_impossible: bool) -> None:
+    """Merge an action that is legal and possible into the topology and the injections; of another, nothing."""
+    state, hidden, injects = environments.state, environments.hidden, environments.orders.injects[i]
+    plays = is_legal
+    if plays and injects and refuse_impossible and request_is_impossible(environments, i):
+        state.illegal[i] = True
+        plays = False
+    _nobody_acts(hidden, i)
+    if plays and environments.orders.n_changes[i] > 0:
+        merge_topology(environments, i)
+    if plays and injects:
+        decode_injection(environments, i)
 
 
 @jit
@@ -109,8 +108,7 @@ def prepare_dispatch(environments: Environments, i: int) -> bool:
     if target_is_out_of_reach(state, i):
         take_back_request(environments, i)
         state.illegal[i] = True
-        hidden.changed_line[i] = -1
-        hidden.changed_sub[i] = -1
+        touch_nothing(hidden, i)
     return needs_dispatch(environments, i)
 
 
@@ -182,13 +180,7 @@ def lose(state: GridState, i: int, reason: int) -> None:
 
 @jit
 def _nobody_acts(hidden: HiddenState, i: int) -> None:
-    hidden.changed_line[i] = -1
-    hidden.changed_sub[i] = -1
-    nobody_injects(hidden, i)
-
-
-@jit
-def nobody_injects(hidden: HiddenState, i: int) -> None:
+    touch_nothing(hidden, i)
     hidden.request[i] = 0.0
     hidden.storage_request[i] = 0.0
 
@@ -212,9 +204,8 @@ def _count_down_lines(environments: Environments, i: int) -> None:
             cooldown[line] = constants.reconnection[0]
         if state.time_next_maintenance[i, line] == 0:
             cooldown[line] = max(cooldown[line], state.duration_next_maintenance[i, line])
-    changed = hidden.changed_line[i]
-    if changed >= 0 and constants.cooldown_line[0] > 0:
-        cooldown[changed] = max(cooldown[changed], constants.cooldown_line[0])
+        if hidden.touched_line[i, line] and constants.cooldown_line[0] > 0:
+            cooldown[line] = max(cooldown[line], constants.cooldown_line[0])
 
 
 @jit
@@ -238,6 +229,5 @@ def _count_down_substations(environments: Environments, i: int) -> None:
     for sub in range(cooldown.shape[0]):
         if cooldown[sub] > 0:
             cooldown[sub] -= 1
-    changed = hidden.changed_sub[i]
-    if changed >= 0:
-        cooldown[changed] = constants.cooldown_sub[0]
+        if hidden.touched_sub[i, sub]:
+            cooldown[sub] = constants.cooldown_sub[0]

@@ -1,16 +1,16 @@
-"""The agent's topology action: whether it is legal, what it touches, and how it is merged into the topology.
+"""The agent's changes of lines and substations: whether they are legal, and how they are merged into the topology.
 
-Only what the project's actions can express; see :class:`rl2grid.mdp.actions.ActionKind`. Lines that an action
-touches, and the substations, cool down afterwards even when nothing changed (Grid2Op's topological impact).
+Lines and substations that an action touches cool down afterwards, even where nothing changed; see
+:mod:`rl2grid.mdp.legality`.
 """
 
 from __future__ import annotations
 
-import numpy as np
-
 from rl2grid.compile import jit
 from rl2grid.engines.native.environments import Environments
-from rl2grid.mdp.actions import ActionKind, is_legal
+from rl2grid.engines.native.hidden_state import HiddenState
+from rl2grid.mdp.actions import ActionKind
+from rl2grid.mdp.legality import AMBIGUOUS, LEGAL, has_element, judge
 from rl2grid.mdp.state import GridState
 
 _MOVE, _SWITCH = int(ActionKind.MOVE), int(ActionKind.SWITCH)
@@ -18,30 +18,50 @@ _RECONNECT, _RESTORE = int(ActionKind.RECONNECT), int(ActionKind.RESTORE)
 
 
 @jit
-def act_on_topology(environments: Environments, i: int, kind: int, target: int, mask: int) -> None:
-    """Merge a topology action into ``topo_vect``, or flag it as illegal and leave everything as it is."""
-    state, hidden = environments.state, environments.hidden
-    hidden.changed_line[i] = -1
-    hidden.changed_sub[i] = -1
-    state.illegal[i] = False
-    state.ambiguous[i] = False
-    if kind == _RESTORE and not _has_element_on_busbar_2(state, i, target):
-        return
-    if not is_legal(state, i, kind, target):
-        state.illegal[i] = True
-        return
-    if kind == _MOVE:
-        hidden.changed_sub[i] = target
-        _move(state, i, target, mask)
-    elif kind == _RESTORE:
-        hidden.changed_sub[i] = target
-        _restore(state, i, target)
-    elif kind == _SWITCH:
-        hidden.changed_line[i] = target
-        _switch(environments, i, target)
-    elif kind == _RECONNECT:
-        hidden.changed_line[i] = target
-        close_line(environments, i, target)
+def judge_order(environments: Environments, i: int) -> bool:
+    """Whether the rules allow the action that row ``i`` is to play; flags it if they do not."""
+    state, orders = environments.state, environments.orders
+    if orders.n_changes[i] == 0:
+        orders.verdict[i], orders.verdict_target[i], orders.verdict_left[i] = LEGAL, -1, 0
+        state.ambiguous[i], state.illegal[i] = False, False
+        return True
+    verdict, target, left = judge(
+        state, i, orders.n_changes[i], orders.kind[i], orders.target[i], orders.mask[i], orders.touches[i]
+    )
+    orders.verdict[i], orders.verdict_target[i], orders.verdict_left[i] = verdict, target, left
+    state.ambiguous[i] = verdict == AMBIGUOUS
+    state.illegal[i] = verdict not in (LEGAL, AMBIGUOUS)
+    return bool(verdict == LEGAL)
+
+
+@jit
+def touch_nothing(hidden: HiddenState, i: int) -> None:
+    """No line and no substation cools down because of what row ``i`` plays."""
+    hidden.touched_line[i] = False
+    hidden.touched_sub[i] = False
+
+
+@jit
+def merge_topology(environments: Environments, i: int) -> None:
+    """Merge the changes of a legal action into ``topo_vect``, in Grid2Op's order: lines, moves, restorations."""
+    orders, hidden = environments.orders, environments.hidden
+    for k in range(orders.n_changes[i]):
+        kind, target = orders.kind[i, k], orders.target[i, k]
+        if kind == _SWITCH:
+            _switch(environments, i, target)
+        elif kind == _RECONNECT:
+            close_line(environments, i, target)
+        if orders.touches[i, k]:
+            if kind in (_SWITCH, _RECONNECT):
+                hidden.touched_line[i, target] = True
+            else:
+                hidden.touched_sub[i, target] = True
+    for k in range(orders.n_changes[i]):
+        if orders.kind[i, k] == _MOVE:
+            _move(environments, i, k)
+    for k in range(orders.n_changes[i]):
+        if orders.kind[i, k] == _RESTORE:
+            _restore(environments, i, k)
 
 
 @jit
@@ -70,28 +90,37 @@ def remember_busbars(environments: Environments, i: int) -> None:
 
 
 @jit
-def _has_element_on_busbar_2(state: GridState, i: int, sub: int) -> bool:
+def _move(environments: Environments, i: int, k: int) -> None:
+    state, orders = environments.state, environments.orders
+    sub = orders.target[i, k]
     first = state.sub_first_element[sub]
-    busbars = state.topo_vect[i, first : first + state.sub_info[sub]]
-    return bool(np.any(busbars == 2))
-
-
-@jit
-def _move(state: GridState, i: int, sub: int, mask: int) -> None:
-    first = state.sub_first_element[sub]
-    for k in range(state.sub_info[sub]):
-        element = first + k
+    for element in range(first, first + state.sub_info[sub]):
         # Elements that are off stay off.
-        if mask >> k & 1 and state.topo_vect[i, element] > 0:
+        if has_element(orders.mask[i, k], element - first) and state.topo_vect[i, element] > 0:
             state.topo_vect[i, element] = 3 - state.topo_vect[i, element]
 
 
 @jit
-def _restore(state: GridState, i: int, sub: int) -> None:
+def _restore(environments: Environments, i: int, k: int) -> None:
+    """Bring the elements that were on busbar 2 to busbar 1; a line opened since they were is closed by that."""
+    state, orders = environments.state, environments.orders
+    sub = orders.target[i, k]
     first = state.sub_first_element[sub]
     for element in range(first, first + state.sub_info[sub]):
-        if state.topo_vect[i, element] == 2:
-            state.topo_vect[i, element] = 1
+        if not has_element(orders.mask[i, k], element - first):
+            continue
+        is_open = state.topo_vect[i, element] < 0
+        state.topo_vect[i, element] = 1
+        if is_open:
+            _close_line_of(environments, i, element)
+
+
+@jit
+def _close_line_of(environments: Environments, i: int, element: int) -> None:
+    state = environments.state
+    for line in range(state.line_or_pos_topo_vect.shape[0]):
+        if state.line_or_pos_topo_vect[line] == element or state.line_ex_pos_topo_vect[line] == element:
+            close_line(environments, i, line)
 
 
 @jit

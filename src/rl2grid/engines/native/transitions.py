@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rl2grid.arrays import F32, I64
+from rl2grid.arrays import F32, I64, U64, Flags
 from rl2grid.engines.action_effects import clipping, refusal
-from rl2grid.engines.native.action_notes import ActionNotes, copy_notes
+from rl2grid.engines.native.action_notes import ActionNotes, copy_notes, verdict_in
 from rl2grid.engines.native.advance import (
     ALONE,
     DEFAULT,
@@ -23,14 +23,23 @@ from rl2grid.engines.native.advance import (
     RECONNECT,
     RECOVERY,
     RELEASED,
-    RESET,
     advance,
     write_observations,
 )
 from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.engines.transition import Transitions
 from rl2grid.grids import Grid
-from rl2grid.mdp.actions import ActionKind, StepAction
+from rl2grid.mdp.actions import (
+    DO_NOTHING,
+    ActionKind,
+    Change,
+    StepAction,
+    check_changes,
+    continuous_layout,
+    mask_integer,
+    mask_words,
+    write_mask,
+)
 from rl2grid.mdp.rewards import default_components, paper_components, released_components
 from rl2grid.scenarios.episodes import EpisodePlan
 
@@ -45,30 +54,75 @@ _ROWS_PER_THREAD = 8
 
 @dataclass(frozen=True)
 class Commands:
-    """What the agents of several environments do, one entry each."""
+    """What the agents of several environments do, one entry each; the changes of all lie behind each other."""
 
+    first: I64
+    """int64 [k + 1], where the changes of each entry begin, and where those of the last one end."""
     kinds: I64
-    """int64 [k], an :class:`~rl2grid.mdp.actions.ActionKind`."""
+    """int64 [change], an :class:`~rl2grid.mdp.actions.ActionKind`."""
     targets: I64
-    """int64 [k], lines or substations."""
-    masks: I64
-    """int64 [k], moved elements."""
+    """int64 [change], lines or substations."""
+    masks: U64
+    """uint64 [change, word], moved elements."""
+    injects: Flags
+    """bool [k], which of them inject."""
     values: F32
-    """float32 [k, continuous]; no columns on topology tasks."""
+    """float32 [k, continuous], their injections; no columns where nobody injects."""
+
+    def __len__(self) -> int:
+        return len(self.injects)
 
     def __getitem__(self, part: slice) -> Commands:
-        return Commands(self.kinds[part], self.targets[part], self.masks[part], self.values[part])
+        start, stop, _ = part.indices(len(self))
+        return replace(self, first=self.first[start : stop + 1], injects=self.injects[part], values=self.values[part])
 
     def take(self, rows: I64) -> Commands:
         """The entries ``rows``."""
-        if len(rows) == len(self.kinds):
+        if len(rows) == len(self):
             return self
-        return Commands(self.kinds[rows], self.targets[rows], self.masks[rows], self.values[rows])
+        counts = np.diff(self.first)[rows]
+        first = np.concatenate(([0], np.cumsum(counts)))
+        changes = np.repeat(self.first[rows] - first[:-1], counts) + np.arange(first[-1])
+        return Commands(
+            first, self.kinds[changes], self.targets[changes], self.masks[changes], self.injects[rows],
+            self.values[rows],
+        )  # fmt: skip
 
     def action(self, k: int) -> StepAction:
         """One entry as an action."""
-        values = self.values[k] if self.kinds[k] == ActionKind.INJECTION else None
-        return StepAction(int(self.kinds[k]), int(self.targets[k]), int(self.masks[k]), values)
+        changes = tuple(
+            Change(int(self.kinds[c]), int(self.targets[c]), mask_integer(self.masks[c]))
+            for c in range(int(self.first[k]), int(self.first[k + 1]))
+            if self.kinds[c] != ActionKind.NOTHING
+        )
+        return StepAction(changes, self.values[k] if self.injects[k] else None)
+
+
+def commands_of(grid: Grid, actions: Sequence[StepAction]) -> Commands:
+    """Actions as one batch.
+
+    Raises:
+        UsageError: a line, substation or element that the grid does not have.
+    """
+    changes = [change for action in actions for change in action.changes]
+    check_changes(grid, changes)
+    masks = np.zeros((len(changes), mask_words(grid)), np.uint64)
+    for change, row in zip(changes, masks, strict=True):
+        write_mask(change.mask, row)
+    injects = [action.values is not None for action in actions]
+    size = continuous_layout(grid).size if any(injects) else 0
+    values = np.zeros((len(actions), size), np.float32)
+    for k, action in enumerate(actions):
+        if action.values is not None:
+            values[k] = action.values
+    return Commands(
+        np.cumsum([0, *(len(action.changes) for action in actions)], dtype=np.int64),
+        np.array([change.kind for change in changes], np.int64),
+        np.array([change.target for change in changes], np.int64),
+        masks,
+        np.array(injects, np.bool_),
+        values,
+    )
 
 
 class ActionEffect:
@@ -81,7 +135,7 @@ class ActionEffect:
 
     def __str__(self) -> str:
         action = self._commands.action(self._row)
-        refused = refusal(action, int(self._notes.cooldown_left[self._row]))
+        refused = refusal(self._grid, verdict_in(self._notes, self._row))
         return refused or clipping(self._grid, self._notes, self._row, action)
 
     __repr__ = __str__
@@ -108,9 +162,7 @@ class NativeTransitions(Transitions):
         self._reward_code = _COMPILED_IN.get(self.reward.components)
         self._threads = ThreadPoolExecutor(os.cpu_count() or 1, "rl2grid")
         self._rows = np.arange(n)
-        self._resets = Commands(
-            np.full(n, RESET, np.int64), np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros((n, 0), np.float32)
-        )
+        self._nothing = commands_of(self.engine.grid, [DO_NOTHING] * n)
 
     @property
     def is_compiled(self) -> bool:
@@ -132,9 +184,9 @@ class NativeTransitions(Transitions):
         if not self.is_compiled:
             super().play(i, action)
             return
-        self._advance_part(self.engine.address, self._rows[i : i + 1], _one(action))
+        self._advance_part(self.engine.address, self._rows[i : i + 1], commands_of(self.engine.grid, [action]), False)
         notes = self.engine.environments.notes
-        refused = refusal(action, int(notes.cooldown_left[i]))
+        refused = refusal(self.engine.grid, verdict_in(notes, i))
         self.action_effects[i] = refused or clipping(self.engine.grid, notes, i, action)
 
     def play_rows(self, rows: I64, commands: Commands, num_threads: int) -> None:
@@ -143,11 +195,11 @@ class NativeTransitions(Transitions):
             for k, i in enumerate(rows.tolist()):
                 self.play(i, commands.action(k))
             return
-        self._advance(rows, commands, num_threads)
+        self._advance(rows, commands, num_threads, False)
 
     def begin_rows(self, rows: I64, num_threads: int) -> None:
         """Play to the first decision in ``rows``, whose episodes the engine has been handed."""
-        self._advance(rows, self._resets[: len(rows)], num_threads)
+        self._advance(rows, self._nothing[: len(rows)], num_threads, True)
 
     def write_observations(self, rows: I64, shift: F32, scale: F32, out: F32) -> None:
         """Write the observations of ``rows``, shifted and scaled, to the same rows of ``out``, float32 [n, feature]."""
@@ -156,34 +208,37 @@ class NativeTransitions(Transitions):
     def action_effects_of(self, commands: Commands) -> NDArray[np.object_]:
         """What became of the actions of all environments, object [n]."""
         if not self.is_compiled:
-            return np.array([self.action_effects[i] for i in range(len(commands.kinds))], object)
+            return np.array([self.action_effects[i] for i in range(len(commands))], object)
         grid, notes = self.engine.grid, copy_notes(self.engine.environments.notes)
-        effects = np.empty(len(commands.kinds), object)
+        effects = np.empty(len(commands), object)
         effects[:] = [ActionEffect(grid, notes, commands, i) for i in range(len(effects))]
         return effects
 
-    def _advance(self, rows: I64, commands: Commands, num_threads: int) -> None:
+    def _advance(self, rows: I64, commands: Commands, num_threads: int, begins: bool) -> None:
         parts = max(1, min(num_threads, len(rows) // _ROWS_PER_THREAD))
         if parts == 1:
-            self._advance_part(self.engine.address, rows, commands)
+            self._advance_part(self.engine.address, rows, commands, begins)
             return
         bounds = [len(rows) * part // parts for part in range(parts + 1)]
         slices = [slice(first, last) for first, last in itertools.pairwise(bounds)]
         addresses = [self.engine.address_for(thread) for thread in range(parts)]
 
         def advance_slice(address: int, part: slice) -> None:
-            self._advance_part(address, rows[part], commands[part])
+            self._advance_part(address, rows[part], commands[part], begins)
 
         list(self._threads.map(advance_slice, addresses, slices))
 
-    def _advance_part(self, address: int, rows: I64, commands: Commands) -> None:
+    def _advance_part(self, address: int, rows: I64, commands: Commands, begins: bool) -> None:
         weights = self.reward.weights
         advance(
             address,
             rows,
+            begins,
+            commands.first,
             commands.kinds,
             commands.targets,
             commands.masks,
+            commands.injects,
             commands.values,
             self._heuristic_code(),
             self._reward_code or DEFAULT,
@@ -197,11 +252,3 @@ class NativeTransitions(Transitions):
         if self.heuristic == "idle":
             return IDLE
         return RECOVERY if self.topology_task else RECONNECT
-
-
-def _one(action: StepAction) -> Commands:
-    values = np.zeros(0, np.float32) if action.values is None else action.values
-    return Commands(
-        np.array([action.kind], np.int64), np.array([action.target], np.int64), np.array([action.mask], np.int64),
-        values[np.newaxis],
-    )  # fmt: skip

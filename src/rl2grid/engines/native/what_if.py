@@ -138,7 +138,7 @@ class WhatIf:
         ends = self.grid.line_or_pos_topo_vect[chosen], self.grid.line_ex_pos_topo_vect[chosen]
         was_open = (snapshot.topo_vect[ends[0]] < 1) & (snapshot.topo_vect[ends[1]] < 1)
         kind = np.where(was_open, NOTHING, SWITCH).astype(np.int8)
-        outcomes = self.solve(snapshot, Changes(kind, chosen, np.zeros(len(chosen), np.uint32)), rho)
+        outcomes = self.solve(snapshot, Changes(kind, chosen, np.zeros((len(chosen), 1), np.uint64)), rho)
         return OutageOutcomes(*outcomes[:3], was_open)
 
     def security(self, snapshot: Snapshot) -> Security:

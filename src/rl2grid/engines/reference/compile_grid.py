@@ -27,6 +27,7 @@ from rl2grid.engines.reference.extract import (
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
 from rl2grid.grids.grid import grid_from_record
+from rl2grid.mdp.actions import full_size
 from rl2grid.powerflow.model import Network, network_from_record
 from rl2grid.scenarios.cache import data_folder
 
@@ -73,7 +74,8 @@ def compile_grid(environment: Any) -> CompiledGrid:
     finally:
         episode.close()
     name = environment_name(environment)
-    identity = Identity(name, name, (), (_number_of_topology_actions(environment),))
+    n_actions = full_size(environment.sub_info.tolist(), int(environment.n_line))
+    identity = Identity(name, name, (), (n_actions,))
     record = {"grid": read_grid_record(environment, identity, maintenance, load_p_max), "network": network}
     _keep(record)
     return _from_record(record)
@@ -106,12 +108,6 @@ def _load_p_max(environment: Any) -> Any:
     if load_p is None or not len(load_p):
         return environment.get_obs().load_p
     return np.max(load_p, axis=0)
-
-
-def _number_of_topology_actions(environment: Any) -> int:
-    """The size of :func:`rl2grid.mdp.actions.full_catalogue`, which may be too large to be built."""
-    moves: list[int] = [(1 << (n_elements - 1)) - 1 for n_elements in environment.sub_info.tolist()]
-    return 1 + sum(moves) + int(environment.n_line)
 
 
 def _hash(record: dict[str, Any]) -> str:

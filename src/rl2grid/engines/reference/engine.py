@@ -17,7 +17,7 @@ from rl2grid.engines import DISPATCHES
 from rl2grid.engines.worlds import History, Home, SeriesName, World, grid_fingerprint, other_values
 from rl2grid.errors import UsageError, one_of
 from rl2grid.grids import Grid
-from rl2grid.mdp.actions import ActionKind, StepAction, decode_continuous, moved_elements
+from rl2grid.mdp.actions import ActionKind, Change, StepAction, check_changes, decode_continuous, moved_elements
 from rl2grid.mdp.opponents import draw_opponent, load_draws, new_opponent_state
 from rl2grid.mdp.state import OBSERVED, OBSERVED_STORAGE, GridState, new_state
 from rl2grid.mdp.termination import GameOver, game_over_reason
@@ -87,7 +87,8 @@ class ReferenceEngine:
         """Play one Grid2Op step of environment ``i``."""
         # A copy: the caller may write other values to the array.
         values = None if action.values is None else action.values.copy()
-        self._actions[i].append(action._replace(values=values))
+        self._actions[i].append(StepAction(action.changes, values))
+        check_changes(self.grid, action.changes)
         state, environment = self.state, self._environments[i]
         impossible = self._is_impossible(i, action)
         observation, _, done, info = environment.step(self._played(i, action, impossible))
@@ -105,6 +106,7 @@ class ReferenceEngine:
 
     def simulate(self, i: int, action: StepAction, horizon: int) -> GridState:
         """``obs.simulate`` of Grid2Op; what it does is described in ``docs/simulate.md``."""
+        check_changes(self.grid, action.changes)
         observation, result = self._observations[i], self._simulated
         if self.state.terminated[i] or observation is None:
             raise UsageError("Nothing can be simulated after a game over: reset the environment first.")
@@ -235,7 +237,7 @@ class ReferenceEngine:
 
     def _is_impossible(self, i: int, action: StepAction) -> bool:
         """Whether the redispatch of an action can never be carried out, which makes it illegal."""
-        if action.kind == ActionKind.INJECTION and action.values is not None:
+        if action.values is not None and not self._is_ambiguous(i, action):
             request = decode_continuous(self.grid, action.values).redispatch
         else:
             # A refused request may leave a target out of reach by a rounding error: Grid2Op then refuses "nothing" too.
@@ -250,6 +252,10 @@ class ReferenceEngine:
             self.grid.gen_pmax,
         )
 
+    def _is_ambiguous(self, i: int, action: StepAction) -> bool:
+        """Whether Grid2Op drops the whole action, its redispatch included, before it looks at the rules."""
+        return len(action.changes) > 1 and bool(self._grid2op_action(i, action).is_ambiguous()[0])
+
     def _played(self, i: int, action: StepAction, impossible: bool) -> Any:
         """The Grid2Op action: under ``dispatch="exact"`` nothing is kept of an impossible one, Grid2Op keeps parts."""
         if impossible and self._dispatch == "exact":
@@ -257,26 +263,21 @@ class ReferenceEngine:
         return self._grid2op_action(i, action)
 
     def _grid2op_action(self, i: int, action: StepAction) -> Any:
-        """A fresh Grid2Op action: Grid2Op caches its verdict of ambiguity on the object."""
-        kind, target = action.kind, action.target
-        if kind == ActionKind.NOTHING:
+        """A fresh Grid2Op action of all parts: Grid2Op caches its verdict of ambiguity on the object."""
+        if not action.changes and action.values is None:
             return self._do_nothing[i]
         result = self._environments[i].action_space()
-        if kind == ActionKind.MOVE:
-            moved = np.zeros(self.grid.dim_topo, np.bool_)
-            moved[moved_elements(self.grid, target, action.mask)] = True
-            result.change_bus = moved
-        elif kind == ActionKind.SWITCH:
-            result.line_change_status = [target]
-        elif kind == ActionKind.RECONNECT:
-            result.line_set_status = [(target, 1)]
-        elif kind == ActionKind.RESTORE:
-            first = int(self.grid.sub_first_element[target])
-            buses = np.zeros(self.grid.dim_topo, np.int32)
-            here = slice(first, first + int(self.grid.sub_info[target]))
-            buses[here] = np.where(self.state.topo_vect[i, here] == 2, 1, 0)
-            result.set_bus = buses
-        elif kind == ActionKind.INJECTION and action.values is not None:
+        self._add_moves(result, [change for change in action.changes if change.kind == ActionKind.MOVE])
+        switched = [change.target for change in action.changes if change.kind == ActionKind.SWITCH]
+        if switched:
+            result.line_change_status = switched
+        closed = [(change.target, 1) for change in action.changes if change.kind == ActionKind.RECONNECT]
+        if closed:
+            result.line_set_status = closed
+        self._add_restorations(
+            result, i, [change.target for change in action.changes if change.kind == ActionKind.RESTORE]
+        )
+        if action.values is not None:
             injection = decode_continuous(self.grid, action.values)
             if injection.redispatch.any():
                 result.redispatch = injection.redispatch
@@ -284,6 +285,24 @@ class ReferenceEngine:
                 result.storage_p = injection.storage
             result.curtail = injection.curtailment_limit
         return result
+
+    def _add_moves(self, result: Any, moves: list[Change]) -> None:
+        if not moves:
+            return
+        moved = np.zeros(self.grid.dim_topo, np.bool_)
+        for change in moves:
+            moved[moved_elements(self.grid, change.target, change.mask)] = True
+        result.change_bus = moved
+
+    def _add_restorations(self, result: Any, i: int, subs: list[int]) -> None:
+        if not subs:
+            return
+        buses = np.zeros(self.grid.dim_topo, np.int32)
+        for sub in subs:
+            first = int(self.grid.sub_first_element[sub])
+            here = slice(first, first + int(self.grid.sub_info[sub]))
+            buses[here] = np.where(self.state.topo_vect[i, here] == 2, 1, 0)
+        result.set_bus = buses
 
 
 def _rebuild(grid: Grid, dispatch: str, opponent: bool, worlds: list[World | None]) -> ReferenceEngine:

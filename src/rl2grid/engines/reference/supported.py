@@ -27,8 +27,6 @@ PARAMETERS: dict[str, float] = {
     "SOFT_OVERFLOW_THRESHOLD": 1.0,
     "ENV_DC": False,
     "FORECAST_DC": False,
-    "MAX_SUB_CHANGED": 1,
-    "MAX_LINE_STATUS_CHANGED": 1,
     "IGNORE_MIN_UP_DOWN_TIME": True,
     "ALLOW_DISPATCH_GEN_SWITCH_OFF": True,
     "LIMIT_INFEASIBLE_CURTAILMENT_STORAGE_ACTION": False,
@@ -48,11 +46,10 @@ FREE_PARAMETERS: tuple[str, ...] = (
     "NB_TIMESTEP_COOLDOWN_LINE",
     "NB_TIMESTEP_COOLDOWN_SUB",
     "HARD_OVERFLOW_THRESHOLD",
+    "MAX_SUB_CHANGED",
+    "MAX_LINE_STATUS_CHANGED",
 )
 """Parameters that a step depends on and that :class:`rl2grid.grids.Rules` holds."""
-
-LARGEST_SUBSTATION = 32
-"""Elements of one substation: moves are masks of 32 bits."""
 
 
 def require_supported(environment: Any) -> None:
@@ -116,6 +113,9 @@ def _parameter_problems(environment: Any) -> Iterator[str]:
         value = getattr(parameters, name)
         if value != simulated:
             yield f"parameter {name} is {value}, only {simulated} is simulated"
+    for name in ("MAX_SUB_CHANGED", "MAX_LINE_STATUS_CHANGED"):
+        if getattr(parameters, name) < 1:
+            yield f"parameter {name} is {getattr(parameters, name)}, only 1 and more are simulated"
     forecast = getattr(environment._observation_space, "obs_env", None)
     for name in (*PARAMETERS, *FREE_PARAMETERS):
         if forecast is not None and getattr(forecast._parameters, name) != getattr(parameters, name):
@@ -144,8 +144,6 @@ def _size_problems(environment: Any) -> Iterator[str]:
         yield "loads and generators may be detached (allow_detachment), which is not simulated"
     if not kind.redispatching_unit_commitment_availble:
         yield "its generators have no limits and costs (prods_charac.csv), without which no dispatch is simulated"
-    if kind.sub_info.max() > LARGEST_SUBSTATION:
-        yield f"a substation has {kind.sub_info.max()} elements, at most {LARGEST_SUBSTATION} are simulated"
     seconds = 3600 / STEPS_PER_HOUR
     if environment.delta_time_seconds != seconds:
         yield f"its time step is {environment.delta_time_seconds:g} s, only {seconds:g} s is simulated"
