@@ -128,5 +128,6 @@ def expected(engine, action):
     """Whether Grid2Op finds an action ambiguous, and whether it is neither that nor illegal."""
     environment = engine.grid2op_environment(0)
     ambiguous = bool(engine._grid2op_action(0, action).is_ambiguous()[0])
-    allowed, _ = environment._game_rules(action=engine._grid2op_action(0, action), env=environment)
+    # Before the first step, _game_rules itself allows everything.
+    allowed, _ = environment._game_rules.legal_action(engine._grid2op_action(0, action), environment)
     return ambiguous, bool(allowed) and not ambiguous
