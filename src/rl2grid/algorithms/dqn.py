@@ -181,13 +181,7 @@ class QNetwork(nn.Module):
 
     continuous = False
 
-    def __init__(
-        self,
-        networks: NetworkFactory,
-        layers: Sequence[int],
-        head: str = SINGLE,
-        count: int = 1,
-    ) -> None:
+    def __init__(self, networks: NetworkFactory, layers: Sequence[int], head: str = SINGLE, count: int = 1) -> None:
         super().__init__()
         self.observation_size, self.action_size = networks.spec.observation_size, networks.spec.action_size
         self.dueling = head == DUELING

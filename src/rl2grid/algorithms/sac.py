@@ -182,11 +182,7 @@ class GaussianActor(nn.Module):
 
     continuous = True
 
-    def __init__(
-        self,
-        networks: NetworkFactory,
-        layers: Sequence[int],
-    ) -> None:
+    def __init__(self, networks: NetworkFactory, layers: Sequence[int]) -> None:
         super().__init__()
         self.observation_size, self.action_size = networks.spec.observation_size, networks.spec.action_size
         self.network = networks.make(Output(per_action=2), layers)
@@ -227,10 +223,7 @@ class CategoricalActor(nn.Module):
     continuous = False
 
     def __init__(
-        self,
-        networks: NetworkFactory,
-        layers: Sequence[int],
-        initial_do_nothing: float | None = None,
+        self, networks: NetworkFactory, layers: Sequence[int], initial_do_nothing: float | None = None
     ) -> None:
         super().__init__()
         self.observation_size, self.action_size = networks.spec.observation_size, networks.spec.action_size
@@ -258,11 +251,7 @@ class CategoricalActor(nn.Module):
 class TwinActionCritics(nn.Module):
     """Two values of every discrete action, learned independently."""
 
-    def __init__(
-        self,
-        networks: NetworkFactory,
-        layers: Sequence[int],
-    ) -> None:
+    def __init__(self, networks: NetworkFactory, layers: Sequence[int]) -> None:
         super().__init__()
         self.networks = nn.ModuleList(networks.make(PER_ACTION, layers) for _ in range(2))
 

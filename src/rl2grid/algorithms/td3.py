@@ -152,11 +152,7 @@ class Actor(nn.Module):
 
     continuous = True
 
-    def __init__(
-        self,
-        networks: NetworkFactory,
-        layers: Sequence[int],
-    ) -> None:
+    def __init__(self, networks: NetworkFactory, layers: Sequence[int]) -> None:
         super().__init__()
         self.observation_size, self.action_size = networks.spec.observation_size, networks.spec.action_size
         self.network = networks.make(PER_ACTION, layers)
