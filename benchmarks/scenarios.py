@@ -22,7 +22,7 @@ from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.engines.native.entry import reset_one, step_one
 from rl2grid.engines.native.orders import write_order
 from rl2grid.engines.native.series import outages_of
-from rl2grid.grids import GRID_IDS, Grid, load_grid
+from rl2grid.grids import GRID_IDS, Grid, find_system, load_grid
 from rl2grid.mdp.actions import DO_NOTHING
 from rl2grid.mdp.opponents import draw_opponent
 from rl2grid.scenarios.bundled import bundled_folders
@@ -38,7 +38,6 @@ from rl2grid.scenarios.generator.calendar import (
 from rl2grid.scenarios.generator.constants import Constants, RenewableConstants, constants_from_record, load_constants
 from rl2grid.scenarios.generator.demand import active_demand, new_demand
 from rl2grid.scenarios.generator.draws import Portion
-from rl2grid.scenarios.generator.maintenance import generated_maintenance
 from rl2grid.scenarios.generator.renewables import new_weather, renewable_production
 from rl2grid.scenarios.generator.security import assess
 from rl2grid.scenarios.generator.year import generate_year
@@ -383,7 +382,7 @@ def survive(engine: NativeEngine, grid: Grid, seed: int, month: int) -> int:
     """Steps that doing nothing survives in a month, with the opponent and planned outages."""
     scenario = generate_month(grid, seed, month)
     stream = Stream(seed, month, Purpose.MAINTENANCE)
-    config = generated_maintenance(grid)
+    config = find_system(grid.id).scenarios.maintenance(grid, "generated")
     outages = sample_maintenance(config, scenario.start_datetime, scenario.n_rows, grid.n_line, stream)
     draws = None
     if grid.opponent.kind != "none":

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from rl2grid.grids import load_grid, rankings
+from rl2grid.grids import find_system, load_grid, system_ids, systems
+from rl2grid.grids.rankings import read_ranking
 
 
 def made_up_arrays(grid_id: str, mean_trials: int = 400) -> dict[str, Any]:
@@ -30,7 +31,7 @@ def use_ranking(monkeypatch: pytest.MonkeyPatch, folder: Path, grid_id: str, arr
     (folder / "data").mkdir(exist_ok=True)
     metadata = np.array(json.dumps({"version": "made-up"}))
     np.savez(folder / "data" / f"{grid_id}.ranking.npz", **arrays, metadata=metadata)
-    monkeypatch.setattr(rankings, "resources", SimpleNamespace(files=lambda _: folder))
-    # Fresh caches: those of the real rankings come back unharmed.
-    for name in ("_load", "_load_trials"):
-        monkeypatch.setattr(rankings, name, getattr(rankings, name).__wrapped__)
+    made_up = read_ranking(grid_id, folder / "data" / f"{grid_id}.ranking.npz")
+    for each in system_ids():
+        system = replace(find_system(each), ranking=made_up if each == grid_id else None)
+        monkeypatch.setitem(systems._SYSTEMS, each, system)

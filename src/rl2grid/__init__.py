@@ -6,7 +6,8 @@ Importing the package registers the tasks with Gymnasium::
     env = gymnasium.make("rl2grid/bus14-T0-v0", heuristic="idle")
 
 :func:`tasks` lists them, :func:`train` trains an agent, :func:`load` brings its policy back, and :func:`evaluate` plays
-the episodes by which agents are compared.
+the episodes by which agents are compared. A grid of one's own gets the same tasks with
+:func:`register_system`.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rl2grid.envs.registration import register_all
+from rl2grid.envs.registration import register_all, register_from_environment, register_system
 
 if TYPE_CHECKING:
     from rl2grid.agents.agent import Agent
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from rl2grid.envs.tasks import Task
     from rl2grid.records.evaluations import Evaluation
 
-__all__ = ["evaluate", "load", "tasks", "train"]
+__all__ = ["evaluate", "load", "register_system", "tasks", "train"]
 __version__ = "0.1.0"
 
 register_all()
@@ -161,3 +162,7 @@ def load(run: str | Path, *, deterministic: bool = True) -> PolicyAgent:
     from rl2grid.algorithms.policy_agent import load_agent
 
     return load_agent(Path(run), deterministic=deterministic)
+
+
+# Last: what it imports may use everything above.
+register_from_environment()

@@ -16,7 +16,7 @@ from grid2op.Rules import AlwaysLegal
 from grid2op.VoltageControler import ControlVoltageFromFile
 from lightsim2grid.algorithm import AlgorithmType
 
-from rl2grid.engines.reference.compile_grid import CompiledGrid, compile_grid, compiled_path, load_compiled
+from rl2grid.engines.reference.compile_grid import compile_grid, compiled_path, load_compiled
 from rl2grid.engines.reference.extract import make_environment
 from rl2grid.engines.reference.supported import (
     FREE_PARAMETERS,
@@ -25,7 +25,7 @@ from rl2grid.engines.reference.supported import (
     require_supported_model,
 )
 from rl2grid.errors import UsageError
-from rl2grid.grids import GRID_IDS, load_grid
+from rl2grid.grids import GRID_IDS, System, load_grid
 from rl2grid.mdp.actions import full_catalogue
 from rl2grid.powerflow.model import load_network
 
@@ -44,7 +44,7 @@ def small():
     environment.close()
 
 
-def assert_same(one: CompiledGrid, other: CompiledGrid) -> None:
+def assert_same(one: System, other: System) -> None:
     for field in fields(one.grid):
         np.testing.assert_equal(getattr(one.grid, field.name), getattr(other.grid, field.name), field.name)
     for name, value in one.network._asdict().items():

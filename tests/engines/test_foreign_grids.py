@@ -9,6 +9,8 @@ from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.engines.native.entry import reset_one
 from rl2grid.engines.reference.compile_grid import compile_grid, load_compiled
 from rl2grid.engines.reference.extract import make_environment
+from rl2grid.envs.registration import register_system, unregister_system
+from rl2grid.grids import load_grid
 from rl2grid.mdp.actions import ActionKind, full_catalogue, moved_elements
 from rl2grid.mdp.state import OBSERVED
 from rl2grid.scenarios.scenario import Scenario
@@ -22,7 +24,10 @@ TOLERANCE = {"a_or": 1e-3, "gen_theta": 1e-4, "load_theta": 1e-4, "rho": 1e-5}
 def environment(request, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RL2GRID_DATA", str(tmp_path_factory.mktemp("data")))
-        yield make_environment(request.param)
+        environment = make_environment(request.param)
+        register_system(compile_grid(environment))
+        yield environment
+        unregister_system(request.param)
 
 
 def scenario_of(environment, name):
@@ -61,9 +66,9 @@ def assert_equal(state, observation, step):
 
 
 def test_a_compiled_grid_plays_like_its_environment(environment):
-    name = environment.name
     compiled = compile_grid(environment)
-    engine = NativeEngine(compiled.grid, 1, network=compiled.network)
+    name = compiled.id
+    engine = NativeEngine(load_grid(name), 1)
     catalogue, generator = full_catalogue(compiled.grid), np.random.default_rng(0)
     observation, ends, changes = environment.reset(), 0, 0
     begin(engine, scenario_of(environment, name))

@@ -9,7 +9,8 @@ import pytest
 from rl2grid.engines.reference.extract import SOURCES, describe_network, make_environment, read_initial_network
 from rl2grid.errors import UsageError
 from rl2grid.grids import GRID_IDS, load_grid
-from rl2grid.powerflow.model import load_network, network_from_record, network_hash
+from rl2grid.grids.network import network_from_record
+from rl2grid.powerflow.model import load_network, network_hash
 
 
 @pytest.fixture(scope="module", params=GRID_IDS)

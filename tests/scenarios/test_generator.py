@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rl2grid.errors import UsageError
-from rl2grid.grids import GRID_IDS, load_grid
+from rl2grid.grids import GRID_IDS, find_system, load_grid
 from rl2grid.scenarios.bundled import interconnections
 from rl2grid.scenarios.generator import generate_month
 from rl2grid.scenarios.generator.arithmetic import exponential, gaussians, sine
@@ -20,7 +20,6 @@ from rl2grid.scenarios.generator.demand import active_demand, new_demand
 from rl2grid.scenarios.generator.dispatch import _share, dispatch, new_market
 from rl2grid.scenarios.generator.draws import Channel, Draws, Portion
 from rl2grid.scenarios.generator.fields import neighbourly, new_field, value
-from rl2grid.scenarios.generator.maintenance import generated_maintenance
 from rl2grid.scenarios.generator.month import hash_of
 from rl2grid.scenarios.generator.security import assess
 from rl2grid.scenarios.generator.year import generate_year
@@ -303,7 +302,7 @@ def test_hash_names_every_value():
 def test_maintenance_of_grids_that_record_it_is_that_of_the_same_lines():
     for grid_id in GRID_IDS:
         grid = load_grid(grid_id)
-        config = generated_maintenance(grid)
+        config = find_system(grid.id).scenarios.maintenance(grid, "generated")
         assert config.lines
         assert max(config.lines) < grid.n_line
         assert grid.maintenance.lines in ((), config.lines)

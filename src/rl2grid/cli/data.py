@@ -26,7 +26,7 @@ from rich.progress import (
 from rich.table import Table
 
 from rl2grid.errors import UsageError
-from rl2grid.grids import GRID_IDS, Grid, load_grid
+from rl2grid.grids import Grid, load_grid, system_ids
 from rl2grid.scenarios import generated, inventory, published
 from rl2grid.scenarios.cache import data_folder, remove_damaged
 from rl2grid.scenarios.download import download_dataset, find_archive
@@ -65,7 +65,7 @@ def _add_list(actions: Any) -> None:
 
 
 def _list(options: argparse.Namespace) -> int:
-    grids = [load_grid(grid_id) for grid_id in (GRID_IDS if options.grid is None else (options.grid,))]
+    grids = [load_grid(grid_id) for grid_id in (system_ids() if options.grid is None else (options.grid,))]
     table = Table(title="Scenarios on this machine", title_justify="left")
     for name in ("grid", "source", "what"):
         table.add_column(name, no_wrap=name != "what")

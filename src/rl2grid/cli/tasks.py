@@ -5,9 +5,8 @@ from __future__ import annotations
 from rich.console import Console
 from rich.table import Table
 
-from rl2grid.envs.tasks import Task, all_tasks
-from rl2grid.errors import one_of
-from rl2grid.grids import GRID_IDS
+from rl2grid.envs.tasks import Task, all_tasks, tasks_of
+from rl2grid.grids import find_system
 from rl2grid.mdp.features import observation_size
 
 
@@ -17,9 +16,7 @@ def print_tasks(grid_id: str | None) -> None:
     Raises:
         UsageError: there is no such grid.
     """
-    if grid_id is not None and grid_id not in GRID_IDS:
-        raise one_of("Grid", grid_id, GRID_IDS)
-    chosen = [task for task in all_tasks().values() if grid_id in (None, task.grid_id)]
+    chosen = tuple(all_tasks().values()) if grid_id is None else tasks_of(find_system(grid_id))
     table = Table(title=f"{len(chosen)} tasks", title_justify="left")
     table.add_column("id", no_wrap=True)
     for name in ("subs", "lines", "gens", "loads", "storages", "observation", "actions"):

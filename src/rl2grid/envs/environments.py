@@ -232,7 +232,7 @@ class Environments:
         from rl2grid.envs.outages_after_action import outages_after
 
         if self._solver is None:
-            self._solver = WhatIf(self.grid, engine.environments.network)
+            self._solver = WhatIf(self.grid)
         return outages_after(engine, i, played, self._solver)
 
     def n_minus_1_score(self, i: int) -> float:

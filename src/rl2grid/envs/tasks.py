@@ -1,4 +1,4 @@
-"""The 103 tasks."""
+"""The tasks of every system, 103 for the seven of the benchmark."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import functools
 from dataclasses import dataclass
 
 from rl2grid.errors import UsageError
-from rl2grid.grids import GRID_IDS, Grid, load_grid
+from rl2grid.grids import Grid, System, find_system, load_grid, system_ids
 
 VERSION = 0
 """Version of every id; raised when anything that defines a result changes."""
@@ -46,15 +46,17 @@ class Task:
         return int(grid.gen_redispatchable.sum() + grid.gen_renewable.sum()) + grid.n_storage
 
 
-@functools.cache
 def all_tasks() -> dict[str, Task]:
-    """Every task by its id: 32 topology, 64 constrained topology and 7 continuous tasks."""
-    tasks = []
-    for grid_id in GRID_IDS:
-        for constraint in (None, *CONSTRAINTS):
-            tasks += [Task(grid_id, "T", level, constraint) for level in range(len(load_grid(grid_id).level_sizes))]
-        tasks.append(Task(grid_id, "R", 0, None))
-    return {task.id: task for task in tasks}
+    """Every task by its id: for the seven grids 32 topology, 64 constrained topology and 7 continuous tasks."""
+    return {task.id: task for grid_id in system_ids() for task in tasks_of(find_system(grid_id))}
+
+
+@functools.lru_cache(maxsize=64)
+def tasks_of(system: System) -> tuple[Task, ...]:
+    """The tasks of one system: topology by level, with and without constraint, and the continuous one."""
+    levels = range(len(system.grid.level_sizes))
+    topology = [Task(system.id, "T", level, constraint) for constraint in (None, *CONSTRAINTS) for level in levels]
+    return (*topology, Task(system.id, "R", 0, None))
 
 
 def find_task(task: Task | str) -> Task:
@@ -68,10 +70,10 @@ def find_task(task: Task | str) -> Task:
     """
     if isinstance(task, Task):
         return task
-    name = task.removeprefix("rl2grid/")
+    name, tasks = task.removeprefix("rl2grid/"), all_tasks()
     for candidate in (f"rl2grid/{name}", f"rl2grid/{name}-v{VERSION}"):
-        if candidate in all_tasks():
-            return all_tasks()[candidate]
+        if candidate in tasks:
+            return tasks[candidate]
     raise _unknown_task(task, name)
 
 
@@ -96,11 +98,11 @@ def constraint_of(task: Task, keyword: str | None) -> str | None:
 
 def _unknown_task(task_id: str, name: str) -> UsageError:
     # The longest grid that begins the name: "bus36-MO-v0-T9" is about bus36-MO-v0.
-    grids = [grid_id for grid_id in GRID_IDS if name.startswith(f"{grid_id}-")]
+    grids = [grid_id for grid_id in system_ids() if name.startswith(f"{grid_id}-")]
     if not grids:
         return UsageError(
             f"Task {task_id!r} does not exist: an id is <grid>-T<level>[-LSI|-TLO]-v{VERSION} or <grid>-R-v{VERSION} "
-            f"with a grid of {', '.join(GRID_IDS)}."
+            f"with a grid of {', '.join(system_ids())}."
         )
     grid_id = max(grids, key=len)
     levels = ", ".join(str(level) for level in range(len(load_grid(grid_id).level_sizes)))

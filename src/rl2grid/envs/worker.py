@@ -18,6 +18,7 @@ from typing import Any, BinaryIO
 
 from rl2grid.envs.local_rows import LocalRows
 from rl2grid.envs.options import TaskOptions
+from rl2grid.envs.registration import own_systems, register_system
 from rl2grid.envs.tasks import Task
 from rl2grid.errors import UsageError
 
@@ -36,7 +37,7 @@ class Worker:
             stdout=subprocess.PIPE,
             env=environment,
         )
-        self.send("make", task, options, n)
+        self.send("make", own_systems(), task, options, n)
 
     def send(self, method: str, *arguments: Any) -> None:
         """Ask for ``method(*arguments)`` without waiting."""
@@ -93,7 +94,10 @@ def serve(requests: BinaryIO, answers: BinaryIO) -> None:
         answer: tuple[str, Any] = ("done", None)
         try:
             if method == "make":
-                rows = LocalRows(*arguments)
+                systems, *description = arguments
+                for system in systems:
+                    register_system(system)
+                rows = LocalRows(*description)
             else:
                 answer = ("done", getattr(rows, method)(*arguments))
         except UsageError as error:

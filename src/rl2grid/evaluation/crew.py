@@ -22,7 +22,7 @@ from typing import Any, BinaryIO, NamedTuple, Protocol, Self
 import gymnasium
 
 from rl2grid.agents.agent import Action, Agent, Info
-from rl2grid.envs.registration import register_all
+from rl2grid.envs.registration import own_systems, register_all, register_system
 from rl2grid.envs.worker import take_standard_streams
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.episode import play_episode
@@ -206,6 +206,7 @@ class _Worker:
         )
         self._thread = threading.Thread(target=self._collect, daemon=True)
         self._thread.start()
+        self._send(own_systems())
         self._send(setting)
 
     def send(self, job: Job) -> None:
@@ -252,6 +253,8 @@ def serve(requests: BinaryIO, answers: BinaryIO) -> None:
         answers.flush()
 
     try:
+        for system in pickle.load(requests):
+            register_system(system)
         bound = BoundAgent(pickle.load(requests))
         while True:
             try:

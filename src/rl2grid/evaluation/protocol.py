@@ -207,7 +207,7 @@ def question(task: Task, keywords: Mapping[str, Any], start: int, scenarios: Seq
         "constraint": constraint_of(task, options["constraint"]),
         "start": start,
         "grid_hash": task.grid.hash,
-        "generator_version": generator_version(options["split"]),
+        "generator_version": generator_version(task.grid_id, options["split"]),
         "scenario_pack_hash": scenario_pack_hash(task.grid_id, options["split"], scenarios),
         "action_set_hash": action_set_hash(task.grid, task.level) if task.kind == "T" else None,
     }

@@ -111,7 +111,7 @@ def run_ranking(
     """Rank the topology actions of a grid and write ``<output>/<grid>.ranking.npz``.
 
     Args:
-        grid_id: one of :data:`rl2grid.grids.GRID_IDS`.
+        grid_id: a registered grid (:func:`rl2grid.grids.system_ids`).
         states: number of operating points.
         seed: which episodes are played.
         sampling: one of :data:`SAMPLINGS`.

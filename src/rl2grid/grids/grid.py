@@ -1,4 +1,4 @@
-"""The seven base grids as immutable data (paper, Table 1), read without Grid2Op.
+"""Grids as immutable data, read without Grid2Op; the files of seven (paper, Table 1) are shipped.
 
 The files under ``data/`` are written by ``python -m rl2grid.engines.reference.extract`` from live
 Grid2Op environments and compared with them by ``tests/grids/test_grid.py``.
@@ -16,7 +16,6 @@ from typing import Any, get_type_hints
 import numpy as np
 
 from rl2grid.arrays import F32, I32, Flags
-from rl2grid.errors import one_of
 
 GRID_IDS: tuple[str, ...] = (
     "bus14",
@@ -27,7 +26,7 @@ GRID_IDS: tuple[str, ...] = (
     "bus118-MOB-v0",
     "bus118-MOB-v1",
 )
-"""Every base grid, in the order of the paper's Table 1."""
+"""The seven grids whose files are shipped, in the order of the paper's Table 1."""
 
 STEPS_PER_HOUR = 12
 """All grids play 5-minute steps."""
@@ -203,27 +202,23 @@ class Grid:
     @functools.cached_property
     def hash(self) -> str:
         """Short hash of everything that defines the grid."""
-        return hashlib.sha256(_file_bytes(self.id)).hexdigest()[:16]
+        record = {field.name: getattr(self, field.name) for field in fields(self)}
+        return hashlib.sha256(json.dumps(record, default=_plain).encode()).hexdigest()[:16]
 
 
-def load_grid(grid_id: str) -> Grid:
-    """The grid called ``grid_id``.
+def read_grid(grid_id: str) -> Grid:
+    """The grid whose file is shipped as ``data/<grid_id>.json``."""
+    content = (resources.files("rl2grid.grids") / "data" / f"{grid_id}.json").read_bytes()
+    return grid_from_record(json.loads(content), hashlib.sha256(content).hexdigest()[:16])
 
-    Raises:
-        UsageError: ``grid_id`` is not one of :data:`GRID_IDS`.
+
+def grid_from_record(record: dict[str, Any], digest: str) -> Grid:
+    """The grid that the plain values of a JSON file describe; its arrays are read-only.
+
+    Args:
+        record: the values.
+        digest: its :attr:`Grid.hash`.
     """
-    if grid_id not in GRID_IDS:
-        raise one_of("Grid", grid_id, GRID_IDS)
-    return _load(grid_id)
-
-
-@functools.cache
-def _load(grid_id: str) -> Grid:
-    return grid_from_record(json.loads(_file_bytes(grid_id)))
-
-
-def grid_from_record(record: dict[str, Any]) -> Grid:
-    """The grid that the plain values of a JSON file describe; its arrays are read-only."""
     hints = get_type_hints(Grid)
     values: dict[str, Any] = {}
     for field in fields(Grid):
@@ -236,12 +231,14 @@ def grid_from_record(record: dict[str, Any]) -> Grid:
         else:
             value = _tuples(value)
         values[field.name] = value
-    return Grid(**values)
+    grid = Grid(**values)
+    vars(grid)["hash"] = digest  # the hash of the file; that of the values would be another one
+    return grid
 
 
 def _tuples(value: Any) -> Any:
     return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
 
 
-def _file_bytes(grid_id: str) -> bytes:
-    return (resources.files("rl2grid.grids") / "data" / f"{grid_id}.json").read_bytes()
+def _plain(value: Any) -> Any:
+    return value.tolist() if isinstance(value, np.ndarray) else vars(value)

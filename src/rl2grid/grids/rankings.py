@@ -4,30 +4,31 @@ A ranking file ``data/<grid>.ranking.npz`` holds the catalogue ids in order, bes
 action's trials and, as JSON, how it was made. It is written by ``rl2grid rank <grid>``; see
 :mod:`rl2grid.evaluation.ranking`.
 
-The order is read with :func:`ranking`, by every task; the trials with :func:`trials`, by people.
+The order is read with :func:`ranking`, by every task below the highest level; the trials with :func:`trials`, by
+people.
 """
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
+import zipfile
 from dataclasses import dataclass
 from importlib import resources
+from importlib.resources.abc import Traversable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rl2grid.errors import UsageError, one_of
-from rl2grid.grids.grid import GRID_IDS, load_grid
+from rl2grid.errors import UsageError
+from rl2grid.grids.systems import find_system, load_grid
 
 
 @dataclass(frozen=True, eq=False)
 class Ranking:
-    """The ranked actions of one grid, best first."""
+    """The ranked actions of one grid, best first, and what came of trying them."""
 
     ids: NDArray[np.int32]
     """Catalogue ids, without do nothing; read-only."""
@@ -35,6 +36,8 @@ class Ranking:
     """How the ranking was made: version, command, seed, number of states, method."""
     hash: str
     """Short hash of the grid and of the ids in order."""
+    trials: Trials | None
+    """None: the ranking does not tell how often each action was tried."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,10 +62,12 @@ def ranking(grid_id: str) -> Ranking:
     """The ranking in use for ``grid_id``.
 
     Raises:
-        UsageError: there is no such grid, or the installation lacks its ranking.
+        UsageError: there is no such grid, or it has no ranking.
     """
-    _check(grid_id)
-    return _load(grid_id)
+    found = find_system(grid_id).ranking
+    if found is None:
+        raise UsageError(f"The ranking of {grid_id} is missing: make it with `rl2grid rank {grid_id}`.")
+    return found
 
 
 def ranking_hash(grid_id: str) -> str:
@@ -74,56 +79,59 @@ def trials(grid_id: str) -> Trials:
     """What came of the trials behind the ranking in use for ``grid_id``.
 
     Raises:
-        UsageError: there is no such grid, the installation lacks its ranking, or the ranking tells nothing of
-            trials or of other actions than the grid has.
+        UsageError: there is no such grid, it has no ranking, or the ranking tells nothing of trials or of other actions
+            than the grid has.
     """
-    _check(grid_id)
-    return _load_trials(grid_id)
-
-
-@functools.cache
-def _load(grid_id: str) -> Ranking:
-    with _opened(grid_id) as arrays:
-        ids = arrays["ids"].astype(np.int32)
-        metadata = json.loads(str(arrays["metadata"]))
-    ids.setflags(write=False)
-    digest = hashlib.sha256(grid_id.encode() + ids.astype("<i4").tobytes()).hexdigest()[:16]
-    return Ranking(ids, metadata, digest)
-
-
-@functools.cache
-def _load_trials(grid_id: str) -> Trials:
-    n_actions = load_grid(grid_id).level_sizes[-1]
-    with _opened(grid_id) as arrays:
-        if not {"trials", "survived", "margin"} <= set(arrays):
-            raise UsageError(
-                f"The ranking of {grid_id} does not tell how often its actions were tried: "
-                f"make it anew with `rl2grid rank {grid_id}`."
-            )
-        loaded = Trials(
-            arrays["trials"].astype(np.uint32),
-            arrays["survived"].astype(np.uint32),
-            arrays["margin"].astype(np.float32),
+    found, n_actions = ranking(grid_id).trials, load_grid(grid_id).level_sizes[-1]
+    if found is None:
+        raise UsageError(
+            f"The ranking of {grid_id} does not tell how often its actions were tried: "
+            f"make it anew with `rl2grid rank {grid_id}`."
         )
-    for array in (loaded.trials, loaded.survived, loaded.margin):
+    for array in (found.trials, found.survived, found.margin):
         if array.shape != (n_actions,):
             raise UsageError(
                 f"The ranking of {grid_id} tells of {len(array):,} actions where the grid has {n_actions:,}: "
                 f"make it anew with `rl2grid rank {grid_id}`."
             )
+    return found
+
+
+def read_ranking(grid_id: str, file: str | Path | Traversable) -> Ranking:
+    """The ranking in a file that ``rl2grid rank`` has written.
+
+    Raises:
+        UsageError: the file cannot be read.
+    """
+    source = Path(file) if isinstance(file, str) else file
+    try:
+        with source.open("rb") as stream, np.load(stream) as arrays:
+            ids = arrays["ids"].astype(np.int32)
+            metadata = json.loads(str(arrays["metadata"]))
+            tried = _trials(arrays)
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise UsageError(
+            f"The ranking of {grid_id} in {source} cannot be read ({error}): make it with `rl2grid rank {grid_id}`."
+        ) from error
+    ids.setflags(write=False)
+    digest = hashlib.sha256(grid_id.encode() + ids.astype("<i4").tobytes()).hexdigest()[:16]
+    return Ranking(ids, metadata, digest, tried)
+
+
+def read_shipped_ranking(grid_id: str) -> Ranking | None:
+    """The ranking of a grid whose files are shipped; None where the installation lacks it."""
+    file = resources.files("rl2grid.grids") / "data" / f"{grid_id}.ranking.npz"
+    return read_ranking(grid_id, file) if file.is_file() else None
+
+
+def _trials(arrays: Any) -> Trials | None:
+    if not {"trials", "survived", "margin"} <= set(arrays):
+        return None
+    loaded = Trials(
+        arrays["trials"].astype(np.uint32),
+        arrays["survived"].astype(np.uint32),
+        arrays["margin"].astype(np.float32),
+    )
+    for array in (loaded.trials, loaded.survived, loaded.margin):
         array.setflags(write=False)
     return loaded
-
-
-def _check(grid_id: str) -> None:
-    if grid_id not in GRID_IDS:
-        raise one_of("Grid", grid_id, GRID_IDS)
-
-
-@contextmanager
-def _opened(grid_id: str) -> Iterator[Any]:
-    file = resources.files("rl2grid.grids") / "data" / f"{grid_id}.ranking.npz"
-    if not file.is_file():
-        raise UsageError(f"The ranking of {grid_id} is missing: make it with `rl2grid rank {grid_id}`.")
-    with file.open("rb") as stream, np.load(stream) as arrays:
-        yield arrays

@@ -12,10 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rl2grid.errors import UsageError
-from rl2grid.grids import Grid
-from rl2grid.scenarios.full import is_full_requested
-from rl2grid.scenarios.generated import draw_training_months, maintenance_of
-from rl2grid.scenarios.library import check_in_split, list_scenarios, load_scenario
+from rl2grid.grids import Grid, find_system
+from rl2grid.scenarios.library import check_in_split, draw_scenario, load_scenario
 from rl2grid.scenarios.maintenance import sample_maintenance
 from rl2grid.scenarios.scenario import Scenario
 from rl2grid.scenarios.splits import TRAIN
@@ -78,7 +76,7 @@ def plan_episode(
     if scenario is not None:
         check_in_split(grid.id, split, scenario)
     else:
-        scenario = _choose_scenario(grid, split, seed, number)
+        scenario = draw_scenario(grid.id, split, seed, number)
     series = load_scenario(grid.id, scenario)
     redraws = 0
     if start is None:
@@ -110,17 +108,9 @@ def maintenance_matrix(grid: Grid, scenario: Scenario, plan: EpisodePlan) -> NDA
         return scenario.maintenance
     stream = Stream(plan.seed, plan.number, Purpose.MAINTENANCE)
     start, rows = scenario.series_start_datetime, scenario.series_rows
-    matrix = sample_maintenance(maintenance_of(grid, scenario), start, rows, grid.n_line, stream)
+    config = find_system(grid.id).scenarios.maintenance(grid, scenario.source)
+    matrix = sample_maintenance(config, start, rows, grid.n_line, stream)
     return matrix[scenario.first_row : scenario.first_row + scenario.n_rows]
-
-
-def _choose_scenario(grid: Grid, split: str, seed: int, number: int) -> str:
-    if split == TRAIN and not is_full_requested():
-        return f"generated/{draw_training_months(seed, number)}"
-    ids = list_scenarios(grid.id, split)
-    if split == TRAIN:
-        return ids[Stream(seed, number, Purpose.SCENARIO).integer(len(ids))]
-    return ids[(seed + number) % len(ids)]
 
 
 def _draw_start(grid: Grid, series: Scenario, seed: int, number: int) -> _Start:

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rl2grid.errors import UsageError
-from rl2grid.grids import Grid, MaintenanceConfig
-from rl2grid.scenarios.generated import maintenance_of
+from rl2grid.grids import Grid, MaintenanceConfig, find_system
 from rl2grid.scenarios.progress import Report, ignore
 from rl2grid.scenarios.scenario import Scenario
 
@@ -65,7 +64,7 @@ def _write_files(grid: Grid, scenario: Scenario, folder: Path, report: Report) -
                 report(done, total)
     (folder / "start_datetime.info").write_text(f"{scenario.start_datetime:%Y-%m-%d %H:%M}\n")
     (folder / "time_interval.info").write_text("00:05\n")
-    config = maintenance_of(grid, scenario)
+    config = find_system(grid.id).scenarios.maintenance(grid, scenario.source)
     if config.lines:
         (folder / "maintenance_meta.json").write_text(json.dumps(_maintenance_rules(grid, config), indent=1) + "\n")
 

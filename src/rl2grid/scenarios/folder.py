@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import bz2
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -73,6 +74,7 @@ def read_folder(
     *,
     by_substation: bool = False,
     signed_loads: Sequence[int] | None = None,
+    columns: Mapping[str, str] = MappingProxyType({}),
     report: Report = ignore,
 ) -> FolderContent:
     """The series in the folder ``path``.
@@ -85,6 +87,7 @@ def read_folder(
             generators that the series lacks stay at 0 MW, and what belongs to the other grid alone
             (voltages, outages) is left out.
         signed_loads: Loads that may be negative (interconnections); None: all of them.
+        columns: What columns of the files are called in the grid, where the names differ.
         report: told how many bytes of the files were read.
 
     Raises:
@@ -92,7 +95,7 @@ def read_folder(
     """
     if not path.is_dir():
         raise UsageError(f"There is no scenario folder {path}.")
-    reader = _Reader(grid, path, by_substation, report)
+    reader = _Reader(grid, path, by_substation, columns, report)
     arrays: dict[str, NDArray[Any]] = {}
     for name in _REQUIRED + _OPTIONAL + _OUTAGES:
         if by_substation and name in _OF_ONE_GRID:
@@ -115,10 +118,11 @@ def read_folder(
 class _Reader:
     """Reads the files of one folder and remembers how many rows they must have."""
 
-    def __init__(self, grid: Grid, path: Path, by_substation: bool, report: Report) -> None:
+    def __init__(self, grid: Grid, path: Path, by_substation: bool, columns: Mapping[str, str], report: Report) -> None:
         self._grid = grid
         self._path = path
         self._by_substation = by_substation
+        self._columns = columns
         self._report = report
         self._rows = 0
         self._bytes_read, self._bytes = 0, sum(file.stat().st_size for file in _files(path))
@@ -206,7 +210,7 @@ class _Reader:
         names = self._names(name)
         order = []
         for column in header:
-            element = self._element(name, names, column)
+            element = self._element(name, names, self._columns.get(column, column))
             if element is None:
                 raise UsageError(f"File {file}, column {column}: grid {self._grid.id} has {_listed(names)}.")
             if element in order:

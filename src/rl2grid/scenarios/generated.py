@@ -12,6 +12,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import itertools
+import json
 import multiprocessing
 import re
 import signal
@@ -27,7 +28,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rl2grid.errors import UsageError
-from rl2grid.grids import Grid, MaintenanceConfig, load_grid
+from rl2grid.grids import Grid, System, find_system, load_grid
+from rl2grid.grids.systems import add_system
 from rl2grid.scenarios.cache import FORMAT_VERSION, CachedSeries, cached_series, data_folder
 from rl2grid.scenarios.folder import FolderContent
 from rl2grid.scenarios.scenario import Scenario
@@ -132,16 +134,6 @@ def load_generated(grid: Grid, name: str) -> CachedSeries:
     return series
 
 
-def maintenance_of(grid: Grid, scenario: Scenario) -> MaintenanceConfig:
-    """How planned outages are sampled where ``scenario`` records none."""
-    if scenario.source != "generated":
-        return grid.maintenance
-    # Imported where it is needed, as in _make.
-    from rl2grid.scenarios.generator.maintenance import generated_maintenance
-
-    return generated_maintenance(grid)
-
-
 @functools.cache
 def generator_fingerprint(grid: Grid) -> str:
     """Short hash of everything that decides what the generator makes for ``grid``."""
@@ -150,10 +142,11 @@ def generator_fingerprint(grid: Grid) -> str:
         *(package / "powerflow" / f"{module}.py" for module in _POWER_FLOW),
         *_python_files(package / "scenarios" / "generator"),
         package / "scenarios" / "packs.py",
-        package / "scenarios" / "generator" / "data" / f"{grid.id}.json",
+        package / "grids" / "network.py",
         package / "streams.py",
     ]
-    digest = hashlib.sha256(grid.hash.encode())
+    constants = json.dumps(find_system(grid.id).required_constants(), sort_keys=True)
+    digest = hashlib.sha256(f"{grid.hash} {constants}".encode())
     for source in sources:
         digest.update(source.read_bytes())
     return digest.hexdigest()[:16]
@@ -196,14 +189,16 @@ def make_packs(grid: Grid, months: Iterable[tuple[int, int]], workers: int) -> I
         return
     jobs = [(grid.id, seed, numbers) for seed, numbers in years.items()]
     context = multiprocessing.get_context("spawn")
-    with context.Pool(min(workers, len(jobs)), initializer=_leave_interrupts_to_the_parent) as pool:
+    with context.Pool(min(workers, len(jobs)), initializer=_prepare, initargs=(find_system(grid.id),)) as pool:
         for made in pool.imap_unordered(_make_year, jobs):
             done += made
             yield done
 
 
-def _leave_interrupts_to_the_parent() -> None:
+def _prepare(system: System) -> None:
+    """Make a process know the grid, and leave interrupts to its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    add_system(system)
 
 
 def _make_year(job: tuple[str, int, list[int]]) -> int:

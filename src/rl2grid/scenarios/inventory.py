@@ -6,12 +6,13 @@ import shutil
 from pathlib import Path
 from typing import NamedTuple
 
-from rl2grid.grids import Grid
+from rl2grid.grids import Grid, find_system
 from rl2grid.scenarios.bundled import bundled_folders
 from rl2grid.scenarios.cache import data_folder
 from rl2grid.scenarios.full import full_data_folder
 from rl2grid.scenarios.generated import pack_folder, pack_path, parse_months
 from rl2grid.scenarios.imported import imported_folder, imported_names
+from rl2grid.scenarios.recorded import RecordedScenarios
 from rl2grid.scenarios.splits import HELD_OUT_SPLITS
 
 CACHES = ("series", "packs")
@@ -23,7 +24,7 @@ class StoredSeries(NamedTuple):
 
     grid_id: str
     kind: str
-    """``bundled``, ``generated``, ``imported`` or ``full``."""
+    """``bundled``, ``recorded``, ``generated``, ``imported`` or ``full``."""
     what: str
     """In words."""
     size: int
@@ -33,11 +34,7 @@ class StoredSeries(NamedTuple):
 
 def inventory(grid: Grid) -> list[StoredSeries]:
     """Everything there is of a grid; kinds of which there is nothing are left out."""
-    bundled = list(bundled_folders(grid).values())
-    found = [
-        StoredSeries(grid.id, "bundled", f"{len(bundled)} series", sum(map(size_of, bundled)), bundled[0].parent),
-        *_generated(grid),
-    ]
+    found = [*_recorded(grid), *_generated(grid)]
     names = imported_names(grid)
     if names:
         folder = imported_folder(grid)
@@ -65,7 +62,21 @@ def remove_caches() -> None:
         shutil.rmtree(data_folder() / name, ignore_errors=True)
 
 
+def _recorded(grid: Grid) -> list[StoredSeries]:
+    """What comes with the grid: series of the wheel, or folders that a system of one's own names."""
+    scenarios, kind = find_system(grid.id).scenarios, "bundled"
+    folders = list(bundled_folders(grid).values())
+    if isinstance(scenarios, RecordedScenarios):
+        kind = "recorded"
+        folders = [series for series in scenarios.series.values() if isinstance(series, Path)]
+    if not folders:
+        return []
+    return [StoredSeries(grid.id, kind, f"{len(folders)} series", sum(map(size_of, folders)), folders[0].parent)]
+
+
 def _generated(grid: Grid) -> list[StoredSeries]:
+    if find_system(grid.id).constants is None:
+        return []
     folder = pack_folder(grid)
     packs = list(folder.glob("*.pack"))
     if not packs:

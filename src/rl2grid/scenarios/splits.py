@@ -8,8 +8,12 @@ and has no end. Seeds from 10,000 to 19,999 were used to calibrate the generator
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
+
+from rl2grid.errors import UsageError
+from rl2grid.grids import Grid
+from rl2grid.streams import Purpose, Stream
 
 TRAIN, VALIDATION, TEST, BUNDLED = "train", "validation", "test", "bundled"
 
@@ -40,3 +44,31 @@ HELD_OUT_SPLITS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     }
 )
 """Months per split, for every grid; an id is ``generated/`` and one of these."""
+
+_SHOWN = 20
+
+
+def draw_listed(ids: Sequence[str], split: str, seed: int, number: int) -> str:
+    """What episode ``number`` of the stream of ``seed`` plays of a list: any in training, else one after the other."""
+    if split == TRAIN:
+        return ids[Stream(seed, number, Purpose.SCENARIO).integer(len(ids))]
+    return ids[(seed + number) % len(ids)]
+
+
+def require_listed(grid: Grid, split: str, ids: Sequence[str], scenario_id: str) -> None:
+    """Refuse a series that is not in the list of a split.
+
+    Raises:
+        UsageError: it is not.
+    """
+    if scenario_id in ids:
+        return
+    listed = ", ".join(ids[:_SHOWN]) + (f" or {len(ids) - _SHOWN} more" if len(ids) > _SHOWN else "")
+    raise UsageError(f"Scenario {scenario_id!r} is not in the split {split} of {grid.id}: choose one of {listed}.")
+
+
+def shortened(values: Sequence[str]) -> tuple[str, ...]:
+    """The first of the values, saying how many more there are."""
+    if len(values) <= _SHOWN:
+        return tuple(values)
+    return (*values[:_SHOWN], f"{len(values) - _SHOWN} more")

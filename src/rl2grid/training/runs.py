@@ -463,7 +463,7 @@ def _identity(args: RunArgs) -> dict[str, Any]:
         "task": task.id,
         "engine": args.env_keywords["engine"],
         "grid_hash": task.grid.hash,
-        "generator_version": generator_version(args.env_keywords["split"]),
+        "generator_version": generator_version(task.grid_id, args.env_keywords["split"]),
         "scenario_pack_hash": scenario_pack_hash(task.grid_id, args.env_keywords["split"]),
         "action_set_hash": action_set_hash(task.grid, task.level) if task.kind == "T" else None,
         "versions": library_versions(),

@@ -50,7 +50,7 @@ class NativeEngine:
         n: number of environments.
         dispatch: ``"exact"``, or ``"grid2op"`` with Grid2Op's own problem, start and tolerance in SciPy.
         opponent: whether the grid's opponent attacks.
-        network: electrical model; that of ``grid`` if left out, which must then be one of the seven.
+        network: electrical model; of a grid that no system is registered for; None: that of its system.
 
     Raises:
         UsageError: there is no such dispatch.

@@ -83,7 +83,7 @@ class WhatIf:
 
     Args:
         grid: the grid.
-        network: electrical model; that of ``grid`` if left out, which must then be one of the seven.
+        network: electrical model; of a grid that no system is registered for; None: that of its system.
         num_threads: threads that share a call; every number gives the same bits.
 
     Raises:

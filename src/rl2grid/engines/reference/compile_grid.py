@@ -1,8 +1,8 @@
-"""Any Grid2Op environment as data, so that it can be simulated without Grid2Op.
+"""Any Grid2Op environment as a system, so that it can be simulated without Grid2Op and registered beside the seven.
 
 :func:`compile_grid` reads a live environment once and keeps what it read in the data folder;
 :func:`load_compiled` reads that without importing Grid2Op. Only environments are taken whose every feature is
-simulated (:mod:`rl2grid.engines.reference.supported`).
+simulated (:mod:`rl2grid.engines.reference.supported`). Series stay where they are: a system knows their folders.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import hashlib
 import json
 import os
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import filelock
 import numpy as np
@@ -25,11 +25,12 @@ from rl2grid.engines.reference.extract import (
     read_series,
 )
 from rl2grid.errors import UsageError
-from rl2grid.grids import Grid
+from rl2grid.grids import System
 from rl2grid.grids.grid import grid_from_record
+from rl2grid.grids.network import network_from_record
 from rl2grid.mdp.actions import full_size
-from rl2grid.powerflow.model import Network, network_from_record
 from rl2grid.scenarios.cache import data_folder
+from rl2grid.scenarios.recorded import RecordedScenarios
 
 FORMAT_VERSION = 1
 """Raised whenever the files of compiled grids would be read differently."""
@@ -37,21 +38,12 @@ FORMAT_VERSION = 1
 _HASH_DIGITS = 16
 
 
-class CompiledGrid(NamedTuple):
-    """All that a simulation needs to know about a grid that never changes."""
+def compile_grid(environment: Any) -> System:
+    """Read a Grid2Op environment into a system, and keep it in the data folder.
 
-    grid: Grid
-    """Named after the folder of its environment. There is one level, of all topology actions; ``load_p_max`` is
-    that of the first time series; ``bundled_names`` is empty."""
-    network: Network
-    hash: str
-    """16 hexadecimal digits that name everything read; also ``grid.hash``."""
-
-
-def compile_grid(environment: Any) -> CompiledGrid:
-    """Read a Grid2Op environment into a grid and its network, and keep them in the data folder.
-
-    The environment is left as it is: a copy plays the first row of its first time series.
+    The grid is named after the folder of the environment. It has one level, of all topology actions; ``load_p_max`` is
+    that of the first time series. Every split holds every series of the environment; where these are in no folders
+    there are none. The environment is left as it is: a copy plays the first row of its first time series.
 
     Args:
         environment: a ``grid2op.Environment`` with ``LightSimBackend``. Only its present time series is searched
@@ -77,12 +69,13 @@ def compile_grid(environment: Any) -> CompiledGrid:
     n_actions = full_size(environment.sub_info.tolist(), int(environment.n_line))
     identity = Identity(name, name, (), (n_actions,))
     record = {"grid": read_grid_record(environment, identity, maintenance, load_p_max), "network": network}
-    _keep(record)
-    return _from_record(record)
+    place = _place(environment)
+    _keep(record, place)
+    return _system(record, place)
 
 
-def load_compiled(source: str | Path) -> CompiledGrid:
-    """A grid that :func:`compile_grid` has kept, without Grid2Op.
+def load_compiled(source: str | Path) -> System:
+    """A system that :func:`compile_grid` has kept, without Grid2Op.
 
     Args:
         source: the hash of the grid, or the path of its file (``*.json``).
@@ -91,10 +84,10 @@ def load_compiled(source: str | Path) -> CompiledGrid:
         UsageError: there is no such file, or it is damaged.
     """
     path = Path(source) if str(source).endswith(".json") else compiled_path(str(source))
-    record = _read(path)
-    if record is None:
+    kept = _read(path)
+    if kept is None:
         raise UsageError(f"Compiled grid {source} is missing or damaged ({path}): compile its environment again.")
-    return _from_record(record)
+    return _system(*kept)
 
 
 def compiled_path(grid_hash: str) -> Path:
@@ -115,15 +108,32 @@ def _hash(record: dict[str, Any]) -> str:
     return hashlib.sha256(content.encode()).hexdigest()[:_HASH_DIGITS]
 
 
-def _keep(record: dict[str, Any]) -> None:
+def _place(environment: Any) -> dict[str, Any]:
+    """Where this machine has the environment and its series; no part of what the hash names."""
+    source = environment.chronics_handler.real_data
+    folders = [Path(str(path)) for path in getattr(source, "subpaths", ())]
+    names = {
+        theirs: ours
+        for columns in (environment._names_chronics_to_backend or {}).values()
+        for theirs, ours in columns.items()
+        if theirs != ours
+    }
+    return {
+        "environment": str(environment.get_path_env()),
+        "series": {folder.name: str(folder) for folder in sorted(folders) if folder.is_dir()},
+        "columns": names,
+    }
+
+
+def _keep(record: dict[str, Any], place: dict[str, Any]) -> None:
     path = compiled_path(_hash(record))
-    if _read(path) is not None:
+    if _read(path) == (record, place):
         return
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with filelock.FileLock(path.with_suffix(".lock")):
             temporary = path.with_name(f".{path.name}.{os.getpid()}")
-            temporary.write_text(json.dumps({"hash": _hash(record), **record}))
+            temporary.write_text(json.dumps({"hash": _hash(record), **record, "place": place}))
             os.replace(temporary, path)
     except OSError as error:
         raise UsageError(
@@ -131,18 +141,19 @@ def _keep(record: dict[str, Any]) -> None:
         ) from error
 
 
-def _read(path: Path) -> dict[str, Any] | None:
-    """The record, or None where the file is missing or is not what its hash says."""
+def _read(path: Path) -> tuple[dict[str, Any], dict[str, Any]] | None:
+    """The record and the place, or None where the file is missing or is not what its hash says."""
     try:
         record: dict[str, Any] = json.loads(path.read_text())
-        expected = record.pop("hash")
+        expected, place = record.pop("hash"), record.pop("place")
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
-    return record if _hash(record) == expected else None
+    return (record, place) if _hash(record) == expected else None
 
 
-def _from_record(record: dict[str, Any]) -> CompiledGrid:
-    grid_hash = _hash(record)
-    grid = grid_from_record(record["grid"])
-    vars(grid)["hash"] = grid_hash  # fills the cached property, which would look for the file of a benchmark grid
-    return CompiledGrid(grid, network_from_record(grid, record["network"]), grid_hash)
+def _system(record: dict[str, Any], place: dict[str, Any]) -> System:
+    grid = grid_from_record(record["grid"], _hash(record))
+    series = {name: Path(folder) for name, folder in place["series"].items()}
+    scenarios = RecordedScenarios(series, columns=place["columns"])
+    network = network_from_record(grid, record["network"])
+    return System(grid, network, scenarios, environment=Path(place["environment"]))

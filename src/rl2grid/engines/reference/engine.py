@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import warnings
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ import numpy as np
 from rl2grid.engines import DISPATCHES
 from rl2grid.engines.worlds import History, Home, SeriesName, World, grid_fingerprint, other_values
 from rl2grid.errors import UsageError, one_of
-from rl2grid.grids import Grid
+from rl2grid.grids import Grid, find_system
 from rl2grid.mdp.actions import ActionKind, Change, StepAction, check_changes, decode_continuous, moved_elements
 from rl2grid.mdp.opponents import draw_opponent, load_draws, new_opponent_state
 from rl2grid.mdp.state import OBSERVED, OBSERVED_STORAGE, GridState, new_state
@@ -315,7 +314,9 @@ def _rebuild(grid: Grid, dispatch: str, opponent: bool, worlds: list[World | Non
 
 
 def _make_grid2op(grid: Grid, scenario: Any, dispatch: str) -> Any:
-    folder = Path(grid2op.__file__).parent / "data" / grid.bundled_names[0]
+    folder = find_system(grid.id).environment
+    if folder is None:
+        raise UsageError(f'The system {grid.id} names no Grid2Op environment: play it with engine="native".')
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return grid2op.make(

@@ -5,16 +5,15 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib import resources
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rl2grid.arrays import F32, F64, I64
-from rl2grid.errors import one_of
-from rl2grid.grids import GRID_IDS
+from rl2grid.grids import System, find_system
 
 
 class DemandConstants(NamedTuple):
@@ -93,20 +92,21 @@ _SECTIONS: dict[str, Any] = {
 }
 
 
-@functools.cache
 def load_constants(grid_id: str) -> Constants:
-    """The constants of one of the seven grids.
+    """The constants of a grid.
 
     Raises:
-        UsageError: there is no such grid.
+        UsageError: there is no such grid, or nothing was fitted for it.
     """
-    if grid_id not in GRID_IDS:
-        raise one_of("Grid", grid_id, GRID_IDS)
-    text = (resources.files("rl2grid.scenarios.generator") / "data" / f"{grid_id}.json").read_text()
-    return constants_from_record(json.loads(text))
+    return _constants(find_system(grid_id))
 
 
-def constants_from_record(record: dict[str, Any]) -> Constants:
+@functools.lru_cache(maxsize=16)
+def _constants(system: System) -> Constants:
+    return constants_from_record(system.required_constants())
+
+
+def constants_from_record(record: Mapping[str, Any]) -> Constants:
     """The constants that a data file holds."""
     sections: dict[str, Any] = {
         name: kind(**{field: _array(field, item) for field, item in record[name].items()})
