@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from rl2grid.arrays import F64
 from rl2grid.errors import UsageError
-from rl2grid.grids import STEPS_PER_HOUR, Grid
-from rl2grid.grids.rankings import ranking, trials
+from rl2grid.grids import STEPS_PER_HOUR, Grid, find_system
+from rl2grid.grids.rankings import Trials, ranking, trials
 from rl2grid.mdp.actions import (
     WORD_BITS,
     ActionKind,
@@ -103,7 +103,7 @@ def list_actions(grid: Grid, level: int, actions: Sequence[int] | Ids) -> list[A
         UsageError: there is no such level or action, or the ranking tells nothing of trials.
     """
     ids = level_ids(grid, level)
-    catalogue, tried = full_catalogue(grid), trials(grid.id)
+    catalogue, tried = full_catalogue(grid), _trials(grid)
     rank = _ranks(grid)
     for action in actions:
         if not 0 <= action < len(ids):
@@ -270,9 +270,20 @@ def _check_number(what: str, number: int, size: int, grid: Grid) -> None:
 def _ranks(grid: Grid) -> Ids:
     """[catalogue] place in the ranking from 1 on, 0 without one."""
     rank = np.zeros(len(full_catalogue(grid)), np.int32)
+    if find_system(grid.id).ranking is None:
+        return rank
     ids = ranking(grid.id).ids
     rank[ids] = np.arange(1, len(ids) + 1)
     return rank
+
+
+def _trials(grid: Grid) -> Trials:
+    """What came of trying the actions; that none was tried where the grid has no ranking."""
+    if find_system(grid.id).ranking is not None:
+        return trials(grid.id)
+    n_actions = len(full_catalogue(grid))
+    none = np.zeros(n_actions, np.uint32)
+    return Trials(none, none, np.zeros(n_actions, np.float32))
 
 
 def _moves_by_substation(grid: Grid, ids: Ids) -> NDArray[np.int64]:

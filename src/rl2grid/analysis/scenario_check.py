@@ -25,7 +25,7 @@ from rl2grid.analysis.figures import png_bytes
 from rl2grid.arrays import F64
 from rl2grid.drawing.theme import DARK, LIGHT, Theme, style
 from rl2grid.errors import UsageError
-from rl2grid.grids import STEPS_PER_HOUR, Grid
+from rl2grid.grids import STEPS_PER_HOUR, Grid, find_system
 from rl2grid.scenarios.generated import MONTHS, VERSION, generator_fingerprint, month_name
 from rl2grid.scenarios.generator.security import assess
 from rl2grid.scenarios.library import list_scenarios, load_scenario
@@ -104,7 +104,12 @@ class Comparison:
 
 
 def wanted_scenarios(grid: Grid, years: int) -> tuple[str, ...]:
-    """Ids of all bundled series, and of the same months of the generated years 0 to ``years - 1``."""
+    """Ids of all bundled series, and of the same months of the generated years 0 to ``years - 1``.
+
+    Raises:
+        UsageError: no months of the grid can be generated.
+    """
+    find_system(grid.id).required_constants()
     bundled = list_scenarios(grid.id, "bundled")
     months = sorted({month for name in bundled for month in _months_of(load_scenario(grid.id, name))})
     return bundled + tuple(f"generated/{month_name(year, month)}" for year in range(years) for month in months)

@@ -75,6 +75,7 @@ _POLICIES = ("nothing", "greedy", "disturbed")
 _TRIED_BY_GREEDY = 1000
 _COVERED, _WORTHWHILE = 0.9, 0.02
 _TRUST, _RELIEF_WEIGHT = 0.7, 0.001
+_COVERED_WITHOUT_LEVELS = 302  # the size of level 1 on 36 substations
 _CHUNK = 4096  # actions whose statistics are computed at once
 _UNTRIED = np.float16(np.nan)
 
@@ -384,7 +385,11 @@ def _to_be_tried(n_actions: int, seed: int, point: int, sampling: str) -> I32:
 
 
 def _n_covered(grid: Grid) -> int:
-    """Actions chosen for coverage: levels 0 and 1, or level 0 where level 1 is the whole catalogue."""
+    """Actions chosen for coverage: levels 0 and 1, level 0 where level 1 is the whole catalogue, and where there is no
+    level below it as many as a first one is likely to hold.
+    """
+    if len(grid.level_sizes) == 1:
+        return min(_COVERED_WITHOUT_LEVELS, grid.level_sizes[0]) - 1
     return grid.level_sizes[min(1, len(grid.level_sizes) - 2)] - 1
 
 
