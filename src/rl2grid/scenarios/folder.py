@@ -75,6 +75,7 @@ def read_folder(
     by_substation: bool = False,
     signed_loads: Sequence[int] | None = None,
     columns: Mapping[str, str] = MappingProxyType({}),
+    dispatchable_tolerance: float = DISPATCHABLE_TOLERANCE,
     report: Report = ignore,
 ) -> FolderContent:
     """The series in the folder ``path``.
@@ -88,6 +89,7 @@ def read_folder(
             (voltages, outages) is left out.
         signed_loads: Loads that may be negative (interconnections); None: all of them.
         columns: What columns of the files are called in the grid, where the names differ.
+        dispatchable_tolerance: Share of pmax by which a dispatchable generator may exceed it.
         report: told how many bytes of the files were read.
 
     Raises:
@@ -111,7 +113,7 @@ def read_folder(
             arrays[name] = matrix.astype(np.float32)
     reader.refuse_hazards(arrays.pop("hazards", None))
     reader.check_loads(arrays["load_p"], signed_loads)
-    reader.check_generation(arrays["prod_p"])
+    reader.check_generation(arrays["prod_p"], dispatchable_tolerance)
     return FolderContent(read_start(path), arrays)
 
 
@@ -175,9 +177,9 @@ class _Reader:
                 f"{load_p[row, column]} MW, and only interconnections may be negative."
             )
 
-    def check_generation(self, prod_p: NDArray[Any]) -> None:
+    def check_generation(self, prod_p: NDArray[Any], dispatchable_tolerance: float) -> None:
         pmax = self._grid.gen_pmax
-        tolerance = np.where(self._grid.gen_renewable, RENEWABLE_TOLERANCE, DISPATCHABLE_TOLERANCE) * pmax
+        tolerance = np.where(self._grid.gen_renewable, RENEWABLE_TOLERANCE, dispatchable_tolerance) * pmax
         bad = (prod_p > pmax + tolerance) | (prod_p < -DISPATCHABLE_TOLERANCE * pmax)
         if bad.any():
             row, column = np.argwhere(bad)[0]

@@ -20,6 +20,8 @@ from rl2grid.scenarios.scenario import Scenario
 from rl2grid.scenarios.splits import BUNDLED, SPLITS, draw_listed, require_listed, shortened
 
 RECORDED = "recorded"
+OWN_TOLERANCE = 0.1
+"""Share of pmax by which dispatchable generators may exceed it in a grid's own series."""
 
 _NAME = re.compile(r"[^\[\]/\\]+")
 _OF_LOADS = ("load_p", "load_q", "load_p_forecast", "load_q_forecast")
@@ -78,9 +80,11 @@ class RecordedScenarios:
             return cached_series(grid.id, f"{RECORDED}.{name}", _key(content), lambda: content)
         names = repr(sorted(self.columns.items())).encode()
         key = hashlib.sha256(source_key(grid, series).encode() + names).hexdigest()
-        return cached_series(
-            grid.id, f"{RECORDED}.{name}", key, lambda: read_folder(grid, series, columns=self.columns)
-        )
+        return cached_series(grid.id, f"{RECORDED}.{name}", key, lambda: self._read(grid, series))
+
+    def _read(self, grid: Grid, folder: Path) -> FolderContent:
+        # Series that belong to a grid are played as they are: some that come with Grid2Op exceed pmax a little.
+        return read_folder(grid, folder, columns=self.columns, dispatchable_tolerance=OWN_TOLERANCE)
 
     def sample(self, grid: Grid, split: str) -> tuple[str, tuple[str, ...]]:
         return "", self.listed(grid, split)
