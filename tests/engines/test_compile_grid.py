@@ -263,6 +263,8 @@ ENVIRONMENT_CHANGES = {
     "its substations have 3 busbars, only 2": lambda e: change_type(e, n_busbar_per_sub=3),
     "loads and generators may be detached": lambda e: change_type(e, detachment_is_allowed=True),
     "its generators have no limits and costs": lambda e: change_type(e, redispatching_unit_commitment_availble=False),
+    "it has 16,384 substations and 8 lines, only up to 16,383 substations": lambda e: change_type(e, n_sub=16_384),
+    "it has 5 substations and 32,763 lines, .* up to 32,767 of both": lambda e: change_type(e, n_line=32_763),
     "its time step is 900 s, only 300 s": lambda e: setattr(e, "delta_time_seconds", 900.0),
     "its opponent is RandomLineOpponent, only BaseOpponent, Weighted": lambda e: setattr(
         e._oppSpace, "opponent", RandomLineOpponent(e.action_space)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -96,3 +97,19 @@ def test_a_kept_grid_is_the_compiled_one(environment):
     assert kept.hash == compiled.hash
     for ours, theirs in zip(kept.network, compiled.network, strict=True):
         np.testing.assert_array_equal(ours, theirs)
+
+
+def test_both_engines_play_its_tasks_alike(environment):
+    name = compile_grid(environment).id
+    native, reference = (gymnasium.make(f"rl2grid/{name}-R-v0", engine=engine) for engine in ("native", "reference"))
+    rng = np.random.default_rng(0)
+    observations = [env.reset(seed=1)[0] for env in (native, reference)]
+    for _ in range(10):
+        np.testing.assert_allclose(*observations, rtol=0, atol=1e-4)
+        action = rng.uniform(-0.1, 0.1, native.action_space.shape).astype(np.float32)
+        one, other = native.step(action), reference.step(action)
+        assert one[2:4] == other[2:4]
+        np.testing.assert_allclose(one[1], other[1], rtol=0, atol=1e-6)
+        if one[2] or one[3]:
+            break
+        observations = [one[0], other[0]]

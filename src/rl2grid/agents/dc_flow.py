@@ -10,9 +10,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from rl2grid.arrays import F64, I32
+from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
 from rl2grid.mdp.state import GridState
 from rl2grid.powerflow.model import Network
@@ -21,6 +23,8 @@ _LEAST_SHARE = 0.5
 """Share of a line's apparent-power limit that active power may always use, however much reactive power flows."""
 _LEAST_LOADING = 0.05
 """Loadings below say nothing about the limit in MW."""
+LARGEST_TABLE = 2**27
+"""Numbers of a table of sensitivities: 1 GiB. The equations behind it are solved anew at every operating point."""
 
 
 class DcPoint(NamedTuple):
@@ -66,8 +70,8 @@ def is_connected(grid: Grid, busbar: I32) -> bool:
     bus = buses(grid, busbar)
     origin, extremity = bus[grid.line_or_pos_topo_vect], bus[grid.line_ex_pos_topo_vect]
     closed = (origin >= 0) & (extremity >= 0)
-    links = np.zeros((2 * grid.n_sub, 2 * grid.n_sub), np.bool_)
-    links[origin[closed], extremity[closed]] = True
+    ends = (origin[closed], extremity[closed])
+    links = coo_array((np.ones(len(ends[0])), ends), shape=(2 * grid.n_sub, 2 * grid.n_sub))
     _, part = connected_components(links, directed=False)
     return len(np.unique(part[bus[bus >= 0]])) == 1
 
@@ -76,7 +80,15 @@ def sensitivities(grid: Grid, point: DcPoint) -> F64:
     """MW more on each line per MW more into each bus, float64 [line, bus], taken out where the flow is balanced.
 
     Open lines and buses without element have zeros. The grid must be connected.
+
+    Raises:
+        UsageError: the grid is too large for a dense table.
     """
+    if 2 * grid.n_sub * grid.n_line > LARGEST_TABLE:
+        raise UsageError(
+            f"Agents that plan with DC flows need a table of {grid.n_line:,} x {2 * grid.n_sub:,} numbers on "
+            f"{grid.id}, and at most {LARGEST_TABLE:,} are allowed: choose another agent."
+        )
     bus = buses(grid, point.busbar)
     origin, extremity = bus[grid.line_or_pos_topo_vect], bus[grid.line_ex_pos_topo_vect]
     closed = np.flatnonzero((origin >= 0) & (extremity >= 0))

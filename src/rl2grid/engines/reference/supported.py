@@ -51,6 +51,8 @@ FREE_PARAMETERS: tuple[str, ...] = (
 )
 """Parameters that a step depends on and that :class:`rl2grid.grids.Rules` holds."""
 
+LARGEST_INDEX = 65_535
+"""Of the 16 bits in which the power flow numbers its unknowns, two per busbar, and the entries of its admittances."""
 
 def require_supported(environment: Any) -> None:
     """Refuse an environment that has a feature which is not simulated.
@@ -144,6 +146,12 @@ def _size_problems(environment: Any) -> Iterator[str]:
         yield "loads and generators may be detached (allow_detachment), which is not simulated"
     if not kind.redispatching_unit_commitment_availble:
         yield "its generators have no limits and costs (prods_charac.csv), without which no dispatch is simulated"
+    unknowns, entries = 4 * kind.n_sub, 2 * kind.n_sub + 2 * kind.n_line
+    if max(unknowns, entries) > LARGEST_INDEX:
+        yield (
+            f"it has {kind.n_sub:,} substations and {kind.n_line:,} lines, only up to {LARGEST_INDEX // 4:,} "
+            f"substations are simulated, and up to {LARGEST_INDEX // 2:,} of both together"
+        )
     seconds = 3600 / STEPS_PER_HOUR
     if environment.delta_time_seconds != seconds:
         yield f"its time step is {environment.delta_time_seconds:g} s, only {seconds:g} s is simulated"
