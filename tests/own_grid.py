@@ -27,7 +27,7 @@ def own_system(name: str = "mine") -> System:
     """The system, not registered."""
     shipped = find_system("bus14")
     grid = replace(shipped.grid, id=name, bundled_names=(), level_sizes=shipped.grid.level_sizes[-1:])
-    series = {"first": own_series(), "second": own_series(ROWS)}
+    series = {"first": own_series(), "second": own_series(ROWS - 2)}
     scenarios = RecordedScenarios(series, splits={"train": ("first",), "validation": ("second",)})
     return System(grid, shipped.network, scenarios, environment=shipped.environment)
 

@@ -24,9 +24,10 @@ All recorded outages are of lines that the other grid maintains too, last from 9
 
 def _scenarios(grid_id: str) -> Scenarios:
     # Imported where it is needed: importing rl2grid shall not take long.
+    from rl2grid.scenarios.months import GeneratedScenarios
     from rl2grid.scenarios.shipped import ShippedScenarios
 
-    return ShippedScenarios(MAINTAINED_LIKE.get(grid_id))
+    return GeneratedScenarios(ShippedScenarios(), MAINTAINED_LIKE.get(grid_id))
 
 
 def _constants(grid_id: str) -> dict[str, Any]:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import rl2grid  # noqa: F401  (registers the tasks)
+from rl2grid.agents import dc_flow as dc_flow_module
 from rl2grid.agents.agent import Agent
 from rl2grid.agents.dc_flow import buses, dc_flow, dc_point, sensitivities
 from rl2grid.agents.dc_opf import DcOpf, optimal_injections
@@ -122,3 +123,13 @@ def test_topology_tasks_are_refused():
 
 def test_it_is_made_by_its_name():
     assert isinstance(make_agent("dc-opf"), DcOpf)
+
+
+def test_a_table_of_sensitivities_that_is_too_large_is_refused(monkeypatch):
+    environment = gymnasium.make("rl2grid/bus14-R-v0", split="bundled").unwrapped
+    environment.reset(seed=0)
+    point = dc_point(environment.state, 0, environment.grid, load_network(environment.grid))
+    assert sensitivities(environment.grid, point).shape == (20, 28)
+    monkeypatch.setattr(dc_flow_module, "LARGEST_TABLE", 20 * 28 - 1)
+    with pytest.raises(UsageError, match=r"need a table of 20 x 28 numbers on bus14, and at most 559 are allowed"):
+        sensitivities(environment.grid, point)

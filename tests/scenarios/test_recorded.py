@@ -8,7 +8,7 @@ import pytest
 from own_grid import ROWS, own_series, own_system
 
 from rl2grid.errors import UsageError
-from rl2grid.grids import load_grid
+from rl2grid.grids import find_system, load_grid
 from rl2grid.grids.systems import add_system, remove_system
 from rl2grid.scenarios.bundled import bundled_folders
 from rl2grid.scenarios.episodes import plan_episode
@@ -21,6 +21,7 @@ from rl2grid.scenarios.library import (
     load_scenario,
     scenario_pack_hash,
 )
+from rl2grid.scenarios.months import GeneratedScenarios
 from rl2grid.scenarios.recorded import RecordedScenarios
 
 
@@ -51,7 +52,7 @@ def test_splits_hold_what_was_said_and_else_everything(play):
 
 def test_arrays_are_played_as_they_were_given(play):
     play(own_system().scenarios)
-    scenario, given = load_scenario("mine", "recorded/second"), own_series(ROWS)
+    scenario, given = load_scenario("mine", "recorded/second"), own_series(ROWS - 2)
     assert scenario.start_datetime == given.start_datetime
     assert scenario.arrays().keys() == given.arrays.keys()
     for name, array in scenario.arrays().items():
@@ -61,7 +62,7 @@ def test_arrays_are_played_as_they_were_given(play):
 
 
 def test_episodes_are_functions_of_seed_and_number(play):
-    grid = play(RecordedScenarios({name: own_series(ROWS * k) for k, name in enumerate("abcd")}))
+    grid = play(RecordedScenarios({name: own_series(k) for k, name in enumerate("abcd")}))
     plans = [plan_episode(grid, "train", 3, number) for number in range(20)]
     assert plans == [plan_episode(grid, "train", 3, number) for number in range(20)]
     assert {plan.scenario_id for plan in plans} == {f"recorded/{name}" for name in "abcd"}
@@ -151,3 +152,18 @@ def test_unknown_names_are_refused(play):
 def test_impossible_descriptions_are_refused(arguments, message):
     with pytest.raises(UsageError, match=message):
         RecordedScenarios(*arguments)
+
+
+def test_months_are_generated_where_the_system_has_constants():
+    shipped, like = find_system("bus14"), own_system("alike")
+    scenarios = GeneratedScenarios(like.scenarios)
+    add_system(replace(like, scenarios=scenarios, constants=shipped.constants))
+    try:
+        assert list_scenarios("alike", "bundled") == ("recorded/first", "recorded/second")
+        assert list_scenarios("alike", "test") == list_scenarios("bus14", "test")
+        month, other = (load_scenario(name, "generated/800000-00") for name in ("alike", "bus14"))
+        np.testing.assert_array_equal(month.load_p, other.load_p)
+        np.testing.assert_array_equal(month.prod_p, other.prod_p)
+        assert generator_version("alike", "test") == generator_version("bus14", "test")
+    finally:
+        remove_system("alike")

@@ -5,7 +5,7 @@ import pytest
 
 from rl2grid.errors import UsageError
 from rl2grid.grids import GRID_IDS, load_grid
-from rl2grid.scenarios import generated, shipped
+from rl2grid.scenarios import generated, months
 from rl2grid.scenarios.episodes import MAX_STEPS, plan_episode
 from rl2grid.scenarios.library import generator_version, list_scenarios, scenario_pack_hash
 from rl2grid.scenarios.splits import FIRST_TRAINING_SEED, HELD_OUT_SPLITS, SPLITS
@@ -61,7 +61,7 @@ def test_a_window_of_a_listed_scenario_may_be_played() -> None:
 
 
 def test_results_name_the_generator_and_what_was_played(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shipped, "HELD_OUT_SPLITS", {split: names[:2] for split, names in HELD_OUT_SPLITS.items()})
+    monkeypatch.setattr(months, "HELD_OUT_SPLITS", {split: names[:2] for split, names in HELD_OUT_SPLITS.items()})
     hashes = [scenario_pack_hash("bus14", split) for split in SPLITS]
     assert hashes == [scenario_pack_hash("bus14", split) for split in SPLITS]
     assert len(set(hashes)) == 4

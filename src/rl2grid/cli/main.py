@@ -92,7 +92,7 @@ def _demo(options: argparse.Namespace) -> int:
 
 
 def _add_tasks(commands: argparse._SubParsersAction[_Parser]) -> None:
-    parser = commands.add_parser("tasks", help="list the 103 tasks and their sizes")
+    parser = commands.add_parser("tasks", help="list the tasks (103 on the seven grids) and their sizes")
     parser.add_argument("--grid", default=None, help="only the tasks of this grid")
     parser.set_defaults(run=_tasks)
 

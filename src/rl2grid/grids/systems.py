@@ -75,7 +75,7 @@ class Scenarios(Protocol):
     """What a grid is played on: lists, draws and loads its time series.
 
     An id is ``source/name``. :class:`rl2grid.scenarios.recorded.RecordedScenarios` plays series that somebody has,
-    :class:`rl2grid.scenarios.shipped.ShippedScenarios` also generates months.
+    :class:`rl2grid.scenarios.months.GeneratedScenarios` generated months beside them.
     """
 
     def sources(self, grid: Grid) -> Mapping[str, str]:
