@@ -1,4 +1,4 @@
-"""Generated months for training, validation and test (:mod:`rl2grid.scenarios.splits`), beside series that are recorded.
+"""Generated months for training, validation and test (:mod:`rl2grid.scenarios.splits`) beside recorded series.
 
 What is generated has the source ``generated``; it needs the system's constants of the generator. Where Grid2Op's full
 datasets are asked for (:func:`rl2grid.scenarios.full.is_full_requested`), recorded series take the place of all months.

@@ -1,7 +1,7 @@
 """Series that come with Grid2Op: those inside its wheel, and the full datasets where the user has them.
 
-The split ``bundled`` is every series inside the wheel, source ``bundled``, from beginning to end. The source ``full`` is
-Grid2Op's downloadable dataset: ``$RL2GRID_FULL_DATA`` names the folder that holds it (the one with
+The split ``bundled`` is every series inside the wheel, source ``bundled``, from beginning to end. The source ``full``
+is Grid2Op's downloadable dataset: ``$RL2GRID_FULL_DATA`` names the folder that holds it (the one with
 ``l2rpn_case14_sandbox`` and its like inside), and its being set is the request to train, validate and test on it.
 """
 
