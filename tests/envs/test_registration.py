@@ -8,12 +8,13 @@ from dataclasses import replace
 import gymnasium
 import numpy as np
 import pytest
-from own_grid import own_system, registered
+from own_grid import ROWS, own_series, own_system, registered
 
 from rl2grid.envs.registration import own_systems, register_system, unregister_system
 from rl2grid.envs.tasks import all_tasks, find_task
 from rl2grid.errors import UsageError
 from rl2grid.grids import find_system
+from rl2grid.scenarios.folder import FolderContent
 from rl2grid.scenarios.recorded import RecordedScenarios
 
 IDS = ("rl2grid/mine-T0-v0", "rl2grid/mine-T0-LSI-v0", "rl2grid/mine-T0-TLO-v0", "rl2grid/mine-R-v0")
@@ -79,6 +80,20 @@ def test_without_an_environment_there_is_no_reference_engine():
     message = 'names no Grid2Op environment: play it with engine="native"'
     with registered(replace(own_system(), environment=None)), pytest.raises(UsageError, match=message):
         gymnasium.make("rl2grid/mine-R-v0", engine="reference")
+
+
+def test_the_seven_stay_what_they_are():
+    with pytest.raises(UsageError, match="Grid 'bus14' is one of the benchmark: give yours an id of its own"):
+        register_system(replace(find_system("bus14"), scenarios=own_system().scenarios))
+
+
+def test_series_of_the_latest_registration_are_played(mine):
+    assert gymnasium.make("rl2grid/mine-R-v0").reset(seed=0)[1]["episode_length"] <= ROWS - 1
+    content = own_series()
+    shorter = FolderContent(content.start_datetime, {name: array[:40] for name, array in content.arrays.items()})
+    register_system(replace(mine, scenarios=RecordedScenarios({"first": shorter})))
+    env = gymnasium.make("rl2grid/mine-R-v0", split="bundled")
+    assert env.reset(seed=0)[1]["episode_length"] == 39
 
 
 def test_a_grid_without_series_is_refused():

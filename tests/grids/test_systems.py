@@ -36,9 +36,10 @@ def test_a_system_of_ones_own_is_found_beside_them(mine):
         load_grid("other")
 
 
-def test_the_same_system_may_be_registered_again_and_another_one_may_not(mine):
-    add_system(own_system())
-    assert find_system("mine") is mine
+def test_a_system_of_the_same_grid_takes_the_place_and_another_grid_is_refused(mine):
+    other = own_system()
+    add_system(other)
+    assert find_system("mine") is other
     weaker = replace(mine.grid, thermal_limit=mine.grid.thermal_limit / 2)
     with pytest.raises(UsageError, match="Another grid is registered as 'mine': give this one an id of its own"):
         add_system(replace(mine, grid=weaker))

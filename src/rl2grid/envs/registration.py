@@ -26,11 +26,13 @@ def register_system(system: System) -> None:
     """Give a grid everything that the seven have: tasks, scenarios, rankings, evaluation, pages.
 
     Its tasks are ``rl2grid/<id>-T<level>[-LSI|-TLO]-v0`` and ``rl2grid/<id>-R-v0``. Workers of vectors and evaluations
-    know it too. Registering the same system again changes nothing.
+    know it too. It takes the place of an earlier system of the same grid, in environments that are made from then on.
 
     Raises:
-        UsageError: its id cannot be part of a task's, or is that of another system; or there is nothing to play.
+        UsageError: its id cannot be part of a task's, or is that of another grid; or there is nothing to play.
     """
+    if system.id in {each.id for each in BENCHMARK}:
+        raise UsageError(f"Grid {system.id!r} is one of the benchmark: give yours an id of its own.")
     if not system.scenarios.listed(system.grid, BUNDLED):
         raise UsageError(f"System {system.id} has no time series: give it scenarios.")
     _register(system)

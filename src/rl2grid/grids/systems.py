@@ -206,18 +206,18 @@ def load_grid(grid_id: str) -> Grid:
 
 
 def add_system(system: System) -> None:
-    """Make a system known to everything that looks grids up; one that is known already changes nothing.
+    """Make a system known to everything that looks grids up, in the place of an earlier one of the same grid.
 
     Its tasks are registered with Gymnasium by :func:`rl2grid.envs.registration.register_system`.
 
     Raises:
-        UsageError: its id cannot be part of a task's, or is that of another system.
+        UsageError: its id cannot be part of a task's, or is that of another grid.
     """
     if _ID.fullmatch(system.id) is None:
         raise UsageError(f"Grid {system.id!r} cannot name tasks: use letters, digits, '_', '-' and '.' only.")
-    known = _SYSTEMS.setdefault(system.id, system)
-    if known.hash != system.hash:
+    if system.id in _SYSTEMS and _SYSTEMS[system.id].hash != system.hash:
         raise UsageError(f"Another grid is registered as {system.id!r}: give this one an id of its own.")
+    _SYSTEMS[system.id] = system
 
 
 def remove_system(grid_id: str) -> None:

@@ -134,9 +134,13 @@ def load_generated(grid: Grid, name: str) -> CachedSeries:
     return series
 
 
-@functools.cache
 def generator_fingerprint(grid: Grid) -> str:
     """Short hash of everything that decides what the generator makes for ``grid``."""
+    return _fingerprint(find_system(grid.id))
+
+
+@functools.lru_cache(maxsize=64)
+def _fingerprint(system: System) -> str:
     package = resources.files("rl2grid")
     sources = [
         *(package / "powerflow" / f"{module}.py" for module in _POWER_FLOW),
@@ -145,8 +149,8 @@ def generator_fingerprint(grid: Grid) -> str:
         package / "grids" / "network.py",
         package / "streams.py",
     ]
-    constants = json.dumps(find_system(grid.id).required_constants(), sort_keys=True)
-    digest = hashlib.sha256(f"{grid.hash} {constants}".encode())
+    constants = json.dumps(system.required_constants(), sort_keys=True)
+    digest = hashlib.sha256(f"{system.hash} {constants}".encode())
     for source in sources:
         digest.update(source.read_bytes())
     return digest.hexdigest()[:16]

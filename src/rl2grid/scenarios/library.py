@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rl2grid.errors import UsageError, one_of
-from rl2grid.grids import Grid, find_system, load_grid
+from rl2grid.grids import Grid, System, find_system
 from rl2grid.grids.systems import Series
 from rl2grid.scenarios.bundled import interconnections
 from rl2grid.scenarios.cache import data_folder
@@ -71,10 +71,10 @@ def load_scenario(grid_id: str, scenario_id: str) -> Scenario:
     Raises:
         UsageError: Unknown grid or scenario, or a window outside its series.
     """
-    grid = load_grid(grid_id)
+    system = find_system(grid_id)
     if scenario_id.startswith("generated/"):
-        return _load_generated_scenario(grid, scenario_id, data_folder())
-    return _load_scenario(grid, scenario_id, data_folder(), full_data_folder())
+        return _load_generated_scenario(system, scenario_id, data_folder())
+    return _load_scenario(system, scenario_id, data_folder(), full_data_folder())
 
 
 def import_folder(grid: Grid, path: Path, report: Report = ignore) -> Scenario:
@@ -129,18 +129,18 @@ def _check_split(split: str) -> None:
 
 # The sizes bound the number of open memory maps, each of which keeps a file open.
 @functools.lru_cache(maxsize=128)
-def _load_scenario(grid: Grid, scenario_id: str, data: Path, full_data: Path) -> Scenario:
-    return _find_scenario(grid, scenario_id, data, full_data)
+def _load_scenario(system: System, scenario_id: str, data: Path, full_data: Path) -> Scenario:
+    return _find_scenario(system, scenario_id, data, full_data)
 
 
 # Fewer: there is no end of them, and the space of a removed copy is free again only when nothing maps it.
 @functools.lru_cache(maxsize=16)
-def _load_generated_scenario(grid: Grid, scenario_id: str, data: Path) -> Scenario:
-    return _find_scenario(grid, scenario_id, data, data)
+def _load_generated_scenario(system: System, scenario_id: str, data: Path) -> Scenario:
+    return _find_scenario(system, scenario_id, data, data)
 
 
-def _find_scenario(grid: Grid, scenario_id: str, data: Path, full_data: Path) -> Scenario:
-    match, sources = _ID.fullmatch(scenario_id), find_system(grid.id).scenarios.sources(grid)
+def _find_scenario(system: System, scenario_id: str, data: Path, full_data: Path) -> Scenario:
+    match, sources = _ID.fullmatch(scenario_id), system.scenarios.sources(system.grid)
     if match is None or match["source"] not in (*sources, IMPORTED):
         examples = [*sources.values(), f"{IMPORTED}/<name>"]
         raise UsageError(
@@ -148,10 +148,10 @@ def _find_scenario(grid: Grid, scenario_id: str, data: Path, full_data: Path) ->
             f"{examples[0]}[0:144]."
         )
     if match["source"] == "generated":
-        whole = _load_from(grid, "generated", match["series"])
+        whole = _load_from(system, "generated", match["series"])
         warn_of_deviation(whole)
     else:
-        whole = _load_series(grid, match["source"], match["series"], data, full_data)
+        whole = _load_series(system, match["source"], match["series"], data, full_data)
     if match["start"] is None:
         return whole
     start, stop = int(match["start"]), int(match["stop"])
@@ -163,13 +163,14 @@ def _find_scenario(grid: Grid, scenario_id: str, data: Path, full_data: Path) ->
 
 
 @functools.lru_cache(maxsize=128)
-def _load_series(grid: Grid, source: str, name: str, data: Path, full_data: Path) -> Scenario:
-    return _load_from(grid, source, name)
+def _load_series(system: System, source: str, name: str, data: Path, full_data: Path) -> Scenario:
+    return _load_from(system, source, name)
 
 
-def _load_from(grid: Grid, source: str, name: str) -> Scenario:
+def _load_from(system: System, source: str, name: str) -> Scenario:
+    grid = system.grid
     if source != IMPORTED:
-        return _scenario(grid, source, name, find_system(grid.id).scenarios.load(grid, source, name))
+        return _scenario(grid, source, name, system.scenarios.load(grid, source, name))
     if name not in imported_names(grid):
         raise UsageError(
             f"Scenario folder/{name} of {grid.id} was not imported: `rl2grid data import {grid.id} FOLDER` does it."
