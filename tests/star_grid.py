@@ -11,8 +11,8 @@ from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.engines.native.entry import reset_one
 from rl2grid.grids import Grid
 from rl2grid.grids.grid import grid_from_record
+from rl2grid.grids.network import Network, network_from_record
 from rl2grid.mdp.actions import full_size
-from rl2grid.powerflow.model import Network, network_from_record
 from rl2grid.scenarios.scenario import Scenario
 
 N_ROWS = 50

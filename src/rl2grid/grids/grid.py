@@ -212,12 +212,12 @@ def read_grid(grid_id: str) -> Grid:
     return grid_from_record(json.loads(content), hashlib.sha256(content).hexdigest()[:16])
 
 
-def grid_from_record(record: dict[str, Any], digest: str) -> Grid:
+def grid_from_record(record: dict[str, Any], digest: str | None = None) -> Grid:
     """The grid that the plain values of a JSON file describe; its arrays are read-only.
 
     Args:
         record: the values.
-        digest: its :attr:`Grid.hash`.
+        digest: its :attr:`Grid.hash`; None: that of the values.
     """
     hints = get_type_hints(Grid)
     values: dict[str, Any] = {}
@@ -232,7 +232,8 @@ def grid_from_record(record: dict[str, Any], digest: str) -> Grid:
             value = _tuples(value)
         values[field.name] = value
     grid = Grid(**values)
-    vars(grid)["hash"] = digest  # the hash of the file; that of the values would be another one
+    if digest is not None:
+        vars(grid)["hash"] = digest
     return grid
 
 

@@ -54,6 +54,7 @@ FREE_PARAMETERS: tuple[str, ...] = (
 LARGEST_INDEX = 65_535
 """Of the 16 bits in which the power flow numbers its unknowns, two per busbar, and the entries of its admittances."""
 
+
 def require_supported(environment: Any) -> None:
     """Refuse an environment that has a feature which is not simulated.
 
