@@ -105,7 +105,7 @@ def test_outputs_below_a_file_are_refused_before_anything_is_played(capsys, tmp_
 
 def test_an_interrupt_at_once_tells_how_the_training_goes_on(capsys, tmp_path, monkeypatch):
     def interrupted(args, **_):
-        if args.task == "rl2grid/bus14-T0-v0":
+        if args.task.id == "rl2grid/bus14-T0-v0":
             Path("runs/bus14-T0-v0-ppo-1").mkdir(parents=True)
         raise KeyboardInterrupt
 

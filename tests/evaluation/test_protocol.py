@@ -273,7 +273,7 @@ def test_a_worker_that_dies_is_noticed():
 def test_bad_requests_are_refused_in_one_sentence(tmp_path):
     bad = {
         "choose one of do-nothing, random, recovery": {"agent": "ppoo"},
-        "Task 'bus15-T0' does not exist": {"task_id": "bus15-T0"},
+        "Task 'bus15-T0' does not exist": {"task": "bus15-T0"},
         "choose one of train, validation, test, bundled": {"split": "exam"},
         "choose one of None, idle, recovery": {"heuristic": "lazy"},
         "is not in the split validation of bus14": {"scenarios": ["nowhere"]},
@@ -286,7 +286,7 @@ def test_bad_requests_are_refused_in_one_sentence(tmp_path):
     }
     for message, arguments in bad.items():
         with pytest.raises(UsageError, match=message) as caught:
-            evaluate(**{"agent": "random", "task_id": "bus14-T0", "output": tmp_path / "out", **arguments})
+            evaluate(**{"agent": "random", "task": "bus14-T0", "output": tmp_path / "out", **arguments})
         assert "\n" not in str(caught.value)
     assert list(tmp_path.iterdir()) == []
 

@@ -18,7 +18,7 @@ import pandas as pd
 import pytest
 
 import rl2grid
-from rl2grid.envs.tasks import find_task
+from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import AGENTS, make_agent
 from rl2grid.records.files import write_json
@@ -147,7 +147,7 @@ def test_included_studies_are_valid_at_every_scale(name: str):
 def test_cells_of_included_studies_can_be_compared(name: str):
     file = read_toml(included_studies()[name])
     for scale in file["scale"]:
-        asked: dict[str, set[tuple[Any, ...]]] = {}
+        asked: dict[Task, set[tuple[Any, ...]]] = {}
         for cell in parse_study(file, scale).cells:
             asked.setdefault(cell.task, set()).add((cell.split, cell.scenarios, cell.evaluation_seeds))
         assert [task for task, questions in asked.items() if len(questions) > 1] == []

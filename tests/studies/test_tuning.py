@@ -218,10 +218,12 @@ def test_a_poor_trial_is_ended_by_its_validation_survival(tmp_path: Path, monkey
 ONE_TRIAL_AND_A_CRASH = """
 import json, sys
 from pathlib import Path
+from rl2grid.envs.tasks import find_task
 from rl2grid.studies.search import _begin, _open
 from rl2grid.studies.tuning import Tuning
 folder = Path(sys.argv[1])
-tuning = Tuning(**json.loads((folder / "tuning.json").read_text()), output=folder)
+stored = json.loads((folder / "tuning.json").read_text())
+tuning = Tuning(**stored | {"task": find_task(stored["task"])}, output=folder)
 study = _open(tuning)
 trial, _ = _begin(tuning, study)
 trial.set_user_attr("survival", 0.5)

@@ -104,11 +104,11 @@ def test_a_command_asks_for_the_evaluation_that_it_was_made_from(
         raise UsageError("heard")
 
     monkeypatch.setattr("rl2grid.cli.evaluate.evaluate", listen)
-    words = shlex.split(evaluate_command("greedy", "rl2grid/bus14-T0-v0", "test", 3, 2, keywords))
+    words = shlex.split(evaluate_command("greedy", find_task("bus14-T0"), "test", 3, 2, keywords))
     assert words[:2] == ["rl2grid", "evaluate"]
     assert main(words[1:]) == 2
     (((agent, task), chosen),) = asked
-    assert (agent, task, chosen["split"]) == ("greedy", "rl2grid/bus14-T0-v0", "test")
+    assert (agent, task.id, chosen["split"]) == ("greedy", "rl2grid/bus14-T0-v0", "test")
     assert (list(chosen["seeds"]), len(chosen["scenarios"])) == ([0, 1, 2], 2)
     assert {name: value for name, value in chosen.items() if name in ("heuristic", *NAMES)} == keywords
 

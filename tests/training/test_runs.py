@@ -24,6 +24,7 @@ import rl2grid
 from rl2grid.algorithms.checkpoint import load_checkpoint, save_checkpoint
 from rl2grid.algorithms.policy_agent import PolicyAgent, load_agent
 from rl2grid.algorithms.ppo import Args
+from rl2grid.envs.tasks import find_task
 from rl2grid.errors import UsageError
 from rl2grid.training.runs import RunArgs, find_limits, hyperparameters, is_finished, read_config, resume, train
 
@@ -56,7 +57,7 @@ def request(folder: Path, **changes: Any) -> RunArgs:
 
 
 def toy_envs(args: RunArgs) -> ToyGrid:
-    continuous = "-R-" in args.task
+    continuous = args.task.kind == "R"
     return ToyGrid(args.hyperparameters.num_envs, gamma=args.hyperparameters.gamma, continuous=continuous)
 
 
@@ -146,7 +147,7 @@ def test_the_stored_request_is_the_request(tmp_path: Path):
     assert args.hyperparameters == SMALL
     assert args.env_keywords["reward"] == (1.0, 0.5, 0.25)
     assert args.env_keywords["split"] == "train"
-    assert args.task == "rl2grid/bus14-T0-v0"
+    assert args.task == find_task("rl2grid/bus14-T0-v0")
     assert args.folder == folder
     assert asdict(args)["checkpoint_seconds"] == 0.0
 

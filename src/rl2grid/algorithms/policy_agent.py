@@ -15,7 +15,7 @@ from rl2grid.agents.agent import Action, Info, Observation
 from rl2grid.algorithms.checkpoint import load_checkpoint
 from rl2grid.algorithms.registry import find_algorithm
 from rl2grid.envs.normalization import ObservationNormalizer
-from rl2grid.envs.tasks import find_task
+from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
 from rl2grid.streams import Purpose, Stream
 
@@ -108,13 +108,13 @@ class PolicyAgent:
 
 
 def load_agent(
-    path: Path, task_id: str | None = None, *, deterministic: bool = True, name: str | None = None
+    path: Path, task: Task | str | None = None, *, deterministic: bool = True, name: str | None = None
 ) -> PolicyAgent:
     """The policy of a checkpoint, or of a run folder (its best by validation, else its latest).
 
     Args:
         path: A checkpoint file or a run folder.
-        task_id: The task that it is to play; None: the one it was trained on.
+        task: The task that it is to play, or its id; None: the one it was trained on.
         deterministic: Whether to play the most probable action instead of a sample (DQN and TD3 have no others).
         name: What tables call the agent; by default the name of the algorithm.
 
@@ -125,8 +125,7 @@ def load_agent(
     if path.is_dir():
         best = path / BEST_FILE
         path = best if best.is_file() else path / CHECKPOINT_FILE
-    task = None if task_id is None else find_task(task_id).id
-    contents = load_checkpoint(path, task=task)
+    contents = load_checkpoint(path, task=None if task is None else find_task(task).id)
     try:
         return PolicyAgent(contents, deterministic=deterministic, name=name)
     except KeyError as error:

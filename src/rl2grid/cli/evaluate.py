@@ -27,14 +27,14 @@ def run(options: argparse.Namespace) -> int:
     output: Path = options.output or _default_output(options, task.id.removeprefix("rl2grid/"), chosen)
     result = evaluate(
         options.agent,
-        task.id,
+        task,
         split=options.split,
-        scenarios=None if options.months is None else evenly_spread(task.id, options.split, options.months),
+        scenarios=None if options.months is None else evenly_spread(task, options.split, options.months),
         seeds=range(options.seeds),
         workers=options.workers,
         output=output,
         progress=True,
-        command=evaluate_command(options.agent, task.id, options.split, options.seeds, options.months, chosen),
+        command=evaluate_command(options.agent, task, options.split, options.seeds, options.months, chosen),
         **chosen,
     )
     Console().print(rich_table([result.summary], title=f"{task.id}, {options.split} scenarios"))

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 from rl2grid.algorithms.registry import algorithm_names
 from rl2grid.cli.keywords import flag_text, reward_of
 from rl2grid.envs.options import TaskOptions, options_of, options_without
-from rl2grid.envs.tasks import find_task
+from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
 from rl2grid.training.limits import TimeLimit
 
@@ -109,14 +109,14 @@ def _begin(algorithm: str, task_id: str, flags: list[str]) -> int:
         from rl2grid.training.validation import find_validator
     except ImportError as error:
         raise UsageError(f"Training needs {error.name}: install it with `pip install rl2grid[train]`.") from None
-    hyperparameters = runs.hyperparameters(algorithm, task.id, _preset(flags))
+    hyperparameters = runs.hyperparameters(algorithm, task, _preset(flags))
     _refuse_unknown(flags, [*fields(TrainFlags), *options_without(*GIVEN_OTHERWISE), *fields(hyperparameters)])
     own, keywords, hyperparameters = _parse_all(f"rl2grid train {algorithm} {task.id}", flags, hyperparameters)
     limit = TimeLimit(own.max_minutes)
     keywords["reward"] = reward_of(keywords["reward"])
     options_of(task, keywords)
     args = runs.RunArgs(
-        task=task.id,
+        task=task,
         hyperparameters=hyperparameters,
         algorithm=algorithm,
         folder=own.folder,
@@ -136,10 +136,10 @@ def _begin(algorithm: str, task_id: str, flags: list[str]) -> int:
             raise  # the same command begins it
         print(f"rl2grid: interrupted; go on with `rl2grid train --resume {folder}`.", file=sys.stderr)
         return INTERRUPTED
-    return _report(folder, task.id, limit)
+    return _report(folder, task, limit)
 
 
-def _report(folder: Path, task_id: str, limit: TimeLimit) -> int:
+def _report(folder: Path, task: Task, limit: TimeLimit) -> int:
     from rl2grid.training import runs
     from rl2grid.training.energy import energy_line
 
@@ -153,7 +153,7 @@ def _report(folder: Path, task_id: str, limit: TimeLimit) -> int:
     if not finished:
         print(f"Run stopped: {folder}. Go on with `rl2grid train --resume {folder}`.")
         return INTERRUPTED
-    print(f"Run complete: {folder}. Evaluate it with `rl2grid evaluate {folder} {task_id} --split test`.")
+    print(f"Run complete: {folder}. Evaluate it with `rl2grid evaluate {folder} {task.id} --split test`.")
     return 0
 
 

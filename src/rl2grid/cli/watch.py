@@ -13,7 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from rl2grid.cli.train import INTERRUPTED
 from rl2grid.engines import HEURISTICS
-from rl2grid.envs.tasks import find_task
+from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
 from rl2grid.records.files import make_folder
 from rl2grid.scenarios.splits import SPLITS
@@ -53,7 +53,7 @@ def _run(options: argparse.Namespace) -> int:
     make_folder(options.output)
     try:
         with _progress() as progress:
-            recording = _play(options, progress)
+            recording = _play(task, options, progress)
             name = f"{task.id.removeprefix('rl2grid/')}-{recording.agent}-{recording.scenario.replace('/', '-')}"
             path = options.output / f"{name}-{options.seed}"
             for suffix in options.format:
@@ -75,21 +75,23 @@ def _run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _play(options: argparse.Namespace, progress: Progress) -> Any:
+def _play(task: Task, options: argparse.Namespace, progress: Progress) -> Any:
     from rl2grid.evaluation.protocol import AS_TRAINED
     from rl2grid.evaluation.watching import play_to_watch
 
-    task = progress.add_task("Playing", total=None)
+    playing = progress.add_task("Playing", total=None)
     heuristic = {None: AS_TRAINED, "None": None}.get(options.heuristic, options.heuristic)
     return play_to_watch(
         options.agent,
-        options.task,
+        task,
         split=options.split,
         scenario=options.scenario,
         seed=options.seed,
         heuristic=heuristic,
         steps=options.steps,
-        on_step=lambda step, length: progress.update(task, completed=step, total=min(length, options.steps or length)),
+        on_step=lambda step, length: progress.update(
+            playing, completed=step, total=min(length, options.steps or length)
+        ),
     )
 
 

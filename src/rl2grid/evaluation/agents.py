@@ -13,6 +13,7 @@ from rl2grid.agents.greedy_topology import GreedyN1
 from rl2grid.agents.milp import Milp
 from rl2grid.agents.random_agent import RandomAgent
 from rl2grid.agents.recovery import Recovery
+from rl2grid.envs.tasks import Task
 from rl2grid.errors import one_of
 
 AGENTS: dict[str, Callable[[], Agent]] = {
@@ -33,12 +34,12 @@ def kinds_of(name: str) -> tuple[str, ...]:
     return agent.kinds if isinstance(agent, SpecialisedAgent) else ("T", "R")
 
 
-def make_agent(spec: str | Path, task_id: str | None = None) -> Agent:
+def make_agent(spec: str | Path, task: Task | None = None) -> Agent:
     """The agent that ``spec`` asks for.
 
     Args:
         spec: a name of :data:`AGENTS`, or the path of a checkpoint or of a run folder.
-        task_id: the task that the agent is to play; checkpoints of other tasks are refused.
+        task: the task that the agent is to play; checkpoints of other tasks are refused.
 
     Raises:
         UsageError: there is no such agent, or it cannot play the task.
@@ -51,4 +52,4 @@ def make_agent(spec: str | Path, task_id: str | None = None) -> Agent:
     # Imported here: agents without training run without torch.
     from rl2grid.algorithms.policy_agent import load_agent
 
-    return load_agent(path, task_id)
+    return load_agent(path, task)

@@ -8,7 +8,7 @@ from dataclasses import asdict
 from typing import Any
 
 from rl2grid.envs.options import TaskOptions
-from rl2grid.envs.tasks import short_id
+from rl2grid.envs.tasks import Task, short_id
 
 
 def flags(values: Mapping[str, Any]) -> list[str]:
@@ -33,19 +33,19 @@ def environment_flags(keywords: Mapping[str, Any]) -> list[str]:
 
 
 def evaluate_command(
-    agent: str, task_id: str, split: str, seeds: int, months: int | None, keywords: Mapping[str, Any]
+    agent: str, task: Task, split: str, seeds: int, months: int | None, keywords: Mapping[str, Any]
 ) -> str:
     """The ``rl2grid evaluate`` that plays an agent like that.
 
     Args:
         agent: name, run folder or checkpoint.
-        task_id: id of the task.
+        task: the task.
         split: whose months.
         seeds: episodes per month.
         months: of the split, evenly spread; None: all.
         keywords: of ``gymnasium.make``; without ``heuristic``, the one that the agent was trained with is played.
     """
-    words = ["rl2grid", "evaluate", agent, short_id(task_id), "--split", split, "--seeds", str(seeds)]
+    words = ["rl2grid", "evaluate", agent, short_id(task.id), "--split", split, "--seeds", str(seeds)]
     words += [] if months is None else ["--months", str(months)]
     words += ["--heuristic", str(keywords["heuristic"])] if "heuristic" in keywords else []
     return shlex.join([*words, *environment_flags({**keywords, "heuristic": None})])

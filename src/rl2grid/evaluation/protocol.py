@@ -37,7 +37,7 @@ AS_TRAINED = "as trained"
 
 def evaluate(
     agent: str | Path | Agent,
-    task_id: str,
+    task: Task | str,
     *,
     split: str = "validation",
     scenarios: Sequence[str] | None = None,
@@ -56,7 +56,7 @@ def evaluate(
     Args:
         agent: ``"do-nothing"``, ``"random"``, ``"recovery"``, ``"greedy"``, ``"milp"``, ``"dc-opf"``, the path of a
             checkpoint or run folder, or an agent that is not bound to an environment yet.
-        task_id: id of the task; the namespace and the version may be left out.
+        task: the task, or its id, whose namespace and version may be left out.
         split: whose scenarios are played: ``"validation"``, ``"test"``, ``"train"`` or ``"bundled"``.
         scenarios: play these only; None: all of the split.
         seeds: of maintenance, opponent and agent; each scenario has its own draws with the same seed
@@ -74,8 +74,8 @@ def evaluate(
     Raises:
         UsageError: the request cannot be met, or ``output`` holds another evaluation. Nothing was written.
     """
-    task = find_task(task_id)
-    chosen = make_agent(agent, task.id) if isinstance(agent, str | Path) else agent
+    task = find_task(task)
+    chosen = make_agent(agent, task) if isinstance(agent, str | Path) else agent
     keywords = env_keywords(chosen, {**options, "split": split, "heuristic": heuristic})
     chosen_scenarios = _checked_scenarios(task, split, scenarios)
     jobs = _jobs(chosen_scenarios, seeds, start)
@@ -91,15 +91,15 @@ def evaluate(
     )
 
 
-def evenly_spread(task_id: str, split: str, months: int | None) -> tuple[str, ...]:
+def evenly_spread(task: Task, split: str, months: int | None) -> tuple[str, ...]:
     """Some months of a split, evenly spread over it; ``months`` None, or more than there are: all.
 
     Raises:
-        UsageError: no such task or split, or a number of months below 1.
+        UsageError: no such split, or a number of months below 1.
     """
     if months is not None and months < 1:
         raise UsageError(f"months={months} is not allowed: give a number of months, at least 1.")
-    listed = list_scenarios(find_task(task_id).grid_id, split)
+    listed = list_scenarios(task.grid_id, split)
     number = min(months or len(listed), len(listed))
     return tuple(listed[k * len(listed) // number] for k in range(number))
 

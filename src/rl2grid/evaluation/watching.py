@@ -5,7 +5,7 @@ from __future__ import annotations
 import gymnasium
 
 from rl2grid.envs.registration import register_all
-from rl2grid.envs.tasks import find_task
+from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import make_agent
 from rl2grid.evaluation.protocol import AS_TRAINED, env_keywords
@@ -16,7 +16,7 @@ from rl2grid.scenarios.library import check_in_split, list_scenarios
 
 def play_to_watch(
     agent: str,
-    task_id: str,
+    task: Task | str,
     *,
     split: str = "validation",
     scenario: str | None = None,
@@ -29,7 +29,7 @@ def play_to_watch(
 
     Args:
         agent: a name, run folder or checkpoint; see :func:`rl2grid.evaluation.agents.make_agent`.
-        task_id: id of the task; the namespace and the version may be left out.
+        task: the task, or its id, whose namespace and version may be left out.
         split: whose scenario is played.
         scenario: None: the first of the split.
         seed: of maintenance, opponent and agent.
@@ -40,12 +40,12 @@ def play_to_watch(
     Raises:
         UsageError: the request cannot be met; nothing was played.
     """
-    task = find_task(task_id)
+    task = find_task(task)
     if steps is not None and steps < 1:
         raise UsageError(f"steps={steps} is not allowed: give a number of grid steps, at least 1.")
     if seed < 0:
         raise UsageError(f"seed={seed} is not allowed: give an integer that is not negative.")
-    chosen = make_agent(agent, task.id)
+    chosen = make_agent(agent, task)
     keywords = env_keywords(chosen, {"split": split, "heuristic": heuristic})
     if scenario is None:
         scenario = list_scenarios(task.grid_id, split)[0]

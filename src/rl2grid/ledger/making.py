@@ -66,9 +66,9 @@ def make_entry(
     """
     result = load_evaluation(evaluation)
     run = _run_around(evaluation)
-    player = _find_agent(result, run, agent)
-    keywords = keywords_of(result.identity, str(evaluation))
     task = find_task(result.identity["task"])
+    player = _find_agent(result, task, run, agent)
+    keywords = keywords_of(result.identity, str(evaluation))
     check_question(task, keywords, result.identity, scenarios_of(result.episodes), str(evaluation))
     played = []
     with environment(task, keywords) as env:
@@ -102,8 +102,8 @@ def _run_around(evaluation: Path) -> Path | None:
     return None
 
 
-def _find_agent(result: Evaluation, run: Path | None, agent: str | None) -> Agent:
-    identity, task = result.identity, result.identity["task"]
+def _find_agent(result: Evaluation, task: Task, run: Path | None, agent: str | None) -> Agent:
+    identity = result.identity
     if agent is not None:
         candidates: list[str | Path] = [agent]
     elif run is not None:

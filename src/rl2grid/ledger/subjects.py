@@ -22,7 +22,7 @@ class Subject:
 
     configuration: Mapping[str, Any]
     agent: str | Path
-    task: str
+    task: Task
     heuristic: str | None
     training: Mapping[str, Any]
     """How it came to be: command, decisions, minutes; empty without training."""
@@ -34,7 +34,7 @@ class Subject:
 
     def __str__(self) -> str:
         """What messages call it."""
-        return f"{self.agent} on {short_id(self.task)}, heuristic {self.heuristic}"
+        return f"{self.agent} on {short_id(self.task.id)}, heuristic {self.heuristic}"
 
 
 def find_subject(text: str) -> Subject:
@@ -46,7 +46,7 @@ def find_subject(text: str) -> Subject:
     if "@" in text:
         agent, _, rest = text.partition("@")
         task, _, heuristic = rest.partition(":")
-        return _untrained(agent, find_task(task).id, heuristic or None)
+        return _untrained(agent, find_task(task), heuristic or None)
     return _trained(Path(text))
 
 
@@ -63,8 +63,8 @@ def play_test(subject: Subject) -> TestResult:
     return result_of(subject.configuration, subject.training, evaluation)
 
 
-def _untrained(agent: str, task: str, heuristic: str | None) -> Subject:
-    configuration = {"agent": agent, "task": task, "heuristic": heuristic}
+def _untrained(agent: str, task: Task, heuristic: str | None) -> Subject:
+    configuration = {"agent": agent, "task": task.id, "heuristic": heuristic}
     return Subject(configuration, agent, task, heuristic, {})
 
 
@@ -80,7 +80,7 @@ def _trained(folder: Path) -> Subject:
         raise UsageError(f"The run in {str(folder)!r} is not finished: resume it before its test.")
     configuration = {
         "algorithm": args.algorithm,
-        "task": args.task,
+        "task": args.task.id,
         "hyperparameters": identifying(args.hyperparameters),
         "env_keywords": dict(args.env_keywords),
     }

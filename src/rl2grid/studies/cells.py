@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rl2grid.algorithms.registry import Hyperparameters
+from rl2grid.envs.tasks import Task, find_task
 from rl2grid.evaluation.protocol import evenly_spread
 from rl2grid.records.studies import CELLS_FOLDER
 from rl2grid.studies.toml_file import with_tuples
@@ -26,7 +27,7 @@ class Training:
     validations: int
     """Evaluations on the validation scenarios, spread evenly over the budget."""
 
-    def resolved(self, task: str) -> Hyperparameters:
+    def resolved(self, task: Task) -> Hyperparameters:
         """All hyperparameters.
 
         Raises:
@@ -43,7 +44,7 @@ class Cell:
     """Name of its folder, unique in the study."""
     agent: str
     """An agent without training, or the algorithm."""
-    task: str
+    task: Task
     heuristic: str | None
     environment: Mapping[str, Any]
     """Further keywords of ``gymnasium.make``."""
@@ -85,7 +86,7 @@ class Study:
 
 def cell_to_dict(cell: Cell) -> dict[str, Any]:
     """A cell as it is stored in JSON."""
-    return asdict(cell)
+    return asdict(cell) | {"task": cell.task.id}
 
 
 def cell_from_dict(stored: Mapping[str, Any]) -> Cell:
@@ -93,8 +94,9 @@ def cell_from_dict(stored: Mapping[str, Any]) -> Cell:
 
     Raises:
         TypeError: the entries are not those of a cell.
+        UsageError: there is no such task.
     """
-    cell = {**stored, "environment": with_tuples(stored["environment"])}
+    cell = {**stored, "task": find_task(stored["task"]), "environment": with_tuples(stored["environment"])}
     if cell["training"] is not None:
         training = cell["training"]
         cell["training"] = Training(**{**training, "hyperparameters": with_tuples(training["hyperparameters"])})

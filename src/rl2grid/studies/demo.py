@@ -16,6 +16,7 @@ from rich.console import Console
 from rl2grid.analysis.demo_report import write_demo_report
 from rl2grid.analysis.summary_table import rich_table
 from rl2grid.envs.registration import register_all
+from rl2grid.envs.tasks import find_task
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import make_agent
 from rl2grid.evaluation.flags import flags
@@ -102,7 +103,7 @@ def _train(folder: Path, decisions: int) -> Path:
             raise UsageError(f"{folder} holds another training: remove it, or choose another folder with --output.")
         return runs.resume(folder, evaluate=validator(stored))
     args = runs.RunArgs(
-        task=TASK,
+        task=find_task(TASK),
         hyperparameters=hyperparameters,
         folder=folder,
         env_keywords={"heuristic": HEURISTIC},
@@ -130,7 +131,7 @@ def _record(run: Path) -> Recording:
     scenario = list_scenarios("bus14", "test")[-1]
     env = gymnasium.make(TASK, split="test", heuristic=HEURISTIC, disable_env_checker=True)
     try:
-        agent = make_agent(run, TASK)
+        agent = make_agent(run, find_task(TASK))
         agent.bind(env)
         return record_episode(agent, env, scenario=scenario)
     finally:

@@ -296,7 +296,7 @@ def _best(tuning: Tuning) -> Best | None:
 
 
 def _prepare(tuning: Tuning) -> None:
-    wanted = {key: value for key, value in asdict(tuning).items() if key != "output"}
+    wanted = {key: value for key, value in asdict(tuning).items() if key != "output"} | {"task": tuning.task.id}
     stored = read_search(tuning.output)
     if stored is not None:
         for key, value in json.loads(json.dumps(wanted)).items():
@@ -342,7 +342,7 @@ def _only_one(folder: Path) -> Iterator[None]:
 def _progress(tuning: Tuning, console: Console | None) -> Iterator[Any]:
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[best]}"))
     with Progress(*columns, console=console, disable=console is None) as bar:
-        task = bar.add_task(f"{tuning.algorithm} on {tuning.task}", total=tuning.trials, best="")
+        task = bar.add_task(f"{tuning.algorithm} on {tuning.task.id}", total=tuning.trials, best="")
         began = time.monotonic()
 
         def show(study: Any) -> None:

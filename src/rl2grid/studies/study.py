@@ -32,7 +32,7 @@ from typing import Any
 from rl2grid.algorithms.registry import algorithm_names, find_algorithm
 from rl2grid.engines import HEURISTICS
 from rl2grid.envs.options import TaskOptions
-from rl2grid.envs.tasks import constraint_of, find_task
+from rl2grid.envs.tasks import Task, constraint_of, find_task
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import AGENTS, kinds_of
 from rl2grid.mdp.rewards import resolve_reward
@@ -136,7 +136,7 @@ class _Group:
     def cells(self) -> Iterator[Cell]:
         """The product of what the group lists."""
         algorithms, agents = self._names("algorithms", algorithm_names()), self._names("agents", AGENTS)
-        tasks = [find_task(task).id for task in self._names("tasks")]
+        tasks = [find_task(task) for task in self._names("tasks")]
         heuristics = self._names("heuristics", (NO_HEURISTIC, *HEURISTICS)) or [NO_HEURISTIC]
         if not tasks or not (algorithms or agents):
             raise UsageError(f"{upper(self.where)} needs tasks, and algorithms or agents.")
@@ -148,9 +148,9 @@ class _Group:
             for algorithm, seed in itertools.product(algorithms, self._seeds() if algorithms else ()):
                 yield self._cell(algorithm, task, heuristic, self._training(algorithm, seed))
 
-    def _cell(self, agent: str, task: str, heuristic: str, training: Training | None) -> Cell:
+    def _cell(self, agent: str, task: Task, heuristic: str, training: Training | None) -> Cell:
         label = text(self.where, self.table, "label", "")
-        parts = [task.removeprefix("rl2grid/"), agent, heuristic if heuristic != NO_HEURISTIC else "", label]
+        parts = [task.id.removeprefix("rl2grid/"), agent, heuristic if heuristic != NO_HEURISTIC else "", label]
         if training is not None:
             parts.append(str(training.seed))
         chosen = None if heuristic == NO_HEURISTIC else heuristic
@@ -207,13 +207,13 @@ class _Group:
                     raise unknown(f"{upper(self.where)}: hyperparameter of {algorithm}", name, list(known))
                 check_kind(f"{self.where}, hyperparameter {name}", value, known[name])
 
-    def _check_agent(self, agent: str, task: str) -> None:
-        kind = find_task(task).kind
+    def _check_agent(self, agent: str, task: Task) -> None:
+        kind = task.kind
         if kind not in kinds_of(agent):
             able = [other for other in AGENTS if kind in kinds_of(other)]
             raise UsageError(
-                f"{upper(self.where)}: agent {agent!r} cannot play {task}, which has {_ACTIONS[kind]} actions: choose "
-                f"one of {', '.join(able)}."
+                f"{upper(self.where)}: agent {agent!r} cannot play {task.id}, which has {_ACTIONS[kind]} actions: "
+                f"choose one of {', '.join(able)}."
             )
 
     def _environment(self, heuristic: str | None) -> dict[str, Any]:
@@ -264,7 +264,7 @@ _GIVEN_OTHERWISE = ("heuristic", "split", "scenario", "gamma")
 def _check_training_and_constraint(cell: Cell) -> None:
     """Refuse hyperparameters that cannot work, or not under the constraint of the cell."""
     if cell.training is None:
-        constraint_of(find_task(cell.task), cell.environment.get("constraint"))
+        constraint_of(cell.task, cell.environment.get("constraint"))
         return
     hyperparameters, algorithm = cell.training.resolved(cell.task), cell.training.algorithm
     runs.find_limits(runs.RunArgs(cell.task, hyperparameters, algorithm, env_keywords=cell.environment))

@@ -10,7 +10,7 @@ from typing import Any
 
 from rl2grid.algorithms.registry import Hyperparameters, algorithm_names, find_algorithm
 from rl2grid.engines import HEURISTICS
-from rl2grid.envs.tasks import find_task
+from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
 from rl2grid.studies.study import NO_HEURISTIC
 from rl2grid.studies.toml_file import as_table, check_kind, count, read_toml, refuse_unknown_keys, text, unknown
@@ -46,7 +46,7 @@ class Tuning:
     name: str
     output: Path
     algorithm: str
-    task: str
+    task: Task
     heuristic: str | None
     preset: str
     seed: int
@@ -99,7 +99,7 @@ def parse_tuning(contents: Mapping[str, Any], output: Path | None = None) -> Tun
     where = "the search"
     refuse_unknown_keys(where, contents, _KEYS)
     name, algorithm = text(where, contents, "name"), text(where, contents, "algorithm")
-    task = find_task(text(where, contents, "task")).id
+    task = find_task(text(where, contents, "task"))
     heuristic = text(where, contents, "heuristic", NO_HEURISTIC)
     if heuristic not in (NO_HEURISTIC, *HEURISTICS):
         raise unknown("Heuristic", heuristic, (NO_HEURISTIC, *HEURISTICS))

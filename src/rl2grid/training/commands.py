@@ -22,7 +22,7 @@ def train_command(args: runs.RunArgs, preset: str = "default", folder: Path | No
         preset: where its hyperparameters came from.
         folder: to write it to; None: the usual one.
     """
-    words = ["rl2grid", "train", args.algorithm, short_id(args.task)]
+    words = ["rl2grid", "train", args.algorithm, short_id(args.task.id)]
     words += ["--preset", preset] if preset != "default" else []
     chosen, original = asdict(args.hyperparameters), asdict(runs.hyperparameters(args.algorithm, args.task, preset))
     changes = {name: value for name, value in chosen.items() if value != original[name]}

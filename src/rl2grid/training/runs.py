@@ -73,8 +73,8 @@ Evaluate = Callable[[PolicyAgent], Mapping[str, float]]
 class RunArgs:
     """What is to be trained, on what, and where."""
 
-    task: str
-    """Task id, such as ``rl2grid/bus14-T0-v0``; the namespace and the version may be left out."""
+    task: Task
+    """May be given by its id, such as ``rl2grid/bus14-T0-v0``, whose namespace and version may be left out."""
     hyperparameters: Hyperparameters
     """Of the algorithm, the seed and the budget among them; see :func:`hyperparameters`."""
     algorithm: str = "ppo"
@@ -100,19 +100,23 @@ class RunArgs:
     progress: bool = True
     """Whether to show a progress bar."""
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "task", find_task(self.task))
 
-def hyperparameters(algorithm: str, task: str, preset: str = "default", **changes: Any) -> Hyperparameters:
+
+def hyperparameters(algorithm: str, task: Task | str, preset: str = "default", **changes: Any) -> Hyperparameters:
     """A preset of an algorithm for a task, some values changed.
 
     Raises:
         UsageError: no such algorithm, task, preset or hyperparameter, or an algorithm that cannot learn the task.
     """
-    chosen = _checked_algorithm(algorithm, find_task(task))
+    task = find_task(task)
+    chosen = _checked_algorithm(algorithm, task)
     known = [parameter.name for parameter in fields(chosen.args)]
     for name in changes:
         if name not in known:
             raise one_of(f"Hyperparameter of {algorithm}", name, known)
-    resolved: Hyperparameters = chosen.preset(preset, continuous=find_task(task).kind == "R", **changes)
+    resolved: Hyperparameters = chosen.preset(preset, continuous=task.kind == "R", **changes)
     return resolved
 
 
@@ -125,7 +129,7 @@ def find_limits(args: RunArgs) -> dict[str, float]:
         UsageError: Lagrangian PPO without a constraint, or with one whose costs the environments do not report, or a
             keyword that contradicts the task's id.
     """
-    constraint = constraint_of(find_task(args.task), args.env_keywords.get("constraint"))
+    constraint = constraint_of(args.task, args.env_keywords.get("constraint"))
     algorithm = find_algorithm(args.algorithm)
     if algorithm.find_limits is not None:
         limits = algorithm.find_limits(args.hyperparameters, constraint)
@@ -138,7 +142,7 @@ def find_limits(args: RunArgs) -> dict[str, float]:
 
 def find_folder(args: RunArgs) -> Path:
     """Where a run is written."""
-    task = find_task(args.task).id.removeprefix("rl2grid/")
+    task = args.task.id.removeprefix("rl2grid/")
     return Path(args.folder or Path("runs") / f"{task}-{args.algorithm}-{args.hyperparameters.seed}")
 
 
@@ -156,7 +160,7 @@ def make_envs(args: RunArgs) -> VectorEnvironment:
     """The training environments of a run."""
     register_all()
     return gymnasium.make_vec(
-        find_task(args.task).id,
+        args.task.id,
         num_envs=args.hyperparameters.num_envs,
         num_threads=args.num_threads,
         num_workers=args.num_workers,
@@ -227,7 +231,7 @@ def resume(
                 )
         checkpoint = None
         if (folder / CHECKPOINT_FILE).exists():
-            checkpoint = load_checkpoint(folder / CHECKPOINT_FILE, task=args.task)
+            checkpoint = load_checkpoint(folder / CHECKPOINT_FILE, task=args.task.id)
         envs = make_envs(args)
         try:
             trainer = find_algorithm(args.algorithm).trainer(args.hyperparameters, envs)
@@ -293,7 +297,7 @@ class _Run:
         """The sections of a checkpoint, without ``training``."""
         return {
             "algorithm": self.args.algorithm,
-            "task": self.args.task,
+            "task": self.args.task.id,
             "env_keywords": dict(self.args.env_keywords),
             "hyperparameters": asdict(self.args.hyperparameters),
             "identity": dict(self.identity),
@@ -360,7 +364,7 @@ def _run(run: _Run, envs: VectorEnvironment, limit: TimeLimit, checkpoint: Mappi
     after_step = trainer.decisions if checkpoint is not None else -1
     saved_at, saved_decisions = time.monotonic(), trainer.decisions
     config = {"request": _request(args), "identity": dict(run.identity)}
-    title = f"{args.algorithm} on {args.task}"
+    title = f"{args.algorithm} on {args.task.id}"
     with (
         closing(MetricsWriter(run.folder, after_step=after_step, tensorboard=args.tensorboard)) as metrics,
         tracked(run.folder, args.wandb_project, config) as track,
@@ -415,7 +419,7 @@ def _budget(args: RunArgs, trainer: Trainer) -> int:
 
 def _resolved(args: RunArgs) -> RunArgs:
     """The same request with everything filled in that a default decides, checked."""
-    task = find_task(args.task)
+    task = args.task
     _checked_algorithm(args.algorithm, task)
     keywords = dict(args.env_keywords)
     if "gamma" in keywords:
@@ -435,9 +439,9 @@ def _resolved(args: RunArgs) -> RunArgs:
     if args.evaluate_every < 1:
         raise UsageError(f"evaluate_every must be at least 1 decision, not {args.evaluate_every}.")
     if args.validation_months != 0:
-        evenly_spread(task.id, VALIDATION, args.validation_months)
+        evenly_spread(task, VALIDATION, args.validation_months)
     check_tracking(args.wandb_project)
-    resolved = replace(args, task=task.id, folder=find_folder(args), env_keywords=keywords)
+    resolved = replace(args, folder=find_folder(args), env_keywords=keywords)
     find_limits(resolved)  # refuses what cannot be constrained
     return resolved
 
@@ -458,7 +462,7 @@ _ACTIONS = {"T": "discrete", "R": "continuous"}
 
 def _identity(args: RunArgs) -> dict[str, Any]:
     """What results of this run must name (the normaliser's hash changes with training: checkpoints know it)."""
-    task = find_task(args.task)
+    task = args.task
     return {
         "task": task.id,
         "engine": args.env_keywords["engine"],
@@ -483,7 +487,7 @@ def _request(args: RunArgs) -> dict[str, Any]:
     """The request as it is stored: wherever the folder is, it is the same run."""
     request = asdict(args)
     del request["folder"]
-    return request
+    return request | {"task": args.task.id}
 
 
 @contextmanager
