@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from rl2grid.grids import load_grid
-from rl2grid.mdp.constraints import THRESHOLDS, lsi_cost, tlo_cost, update_excused
+from rl2grid.mdp.constraint_table import CONSTRAINTS, THRESHOLDS
+from rl2grid.mdp.constraints import lsi_cost, step_costs, tlo_cost, update_excused
 from rl2grid.mdp.termination import GameOver
 
 LINE = 3
@@ -28,6 +29,15 @@ def charged(state):
 
 def test_thresholds():
     assert THRESHOLDS == {"LSI": 0.0, "TLO": 50.0}
+
+
+def test_every_constraint_of_the_table_has_a_cost_and_a_column_in_its_order(state):
+    assert [constraint.column for constraint in CONSTRAINTS.values()] == ["cost_lsi", "cost_tlo"]
+    assert state.transition_costs.shape[1] == state.episode_costs.shape[1] == len(CONSTRAINTS)
+    open_line(state, LINE)
+    assert dict(zip(CONSTRAINTS, step_costs(state, 0), strict=True)) == {"LSI": 0.0, "TLO": 1.0}
+    state.game_over[0], state.terminated[0] = GameOver.ISLAND, True
+    assert dict(zip(CONSTRAINTS, step_costs(state, 0), strict=True)) == {"LSI": 2.0, "TLO": 0.0}
 
 
 @pytest.mark.parametrize(

@@ -61,7 +61,7 @@ from rl2grid.algorithms.playing import Tally, reported
 from rl2grid.algorithms.registry import Algorithm
 from rl2grid.algorithms.trainer import Played
 from rl2grid.errors import UsageError, one_of
-from rl2grid.mdp.constraints import THRESHOLDS
+from rl2grid.mdp.constraint_table import THRESHOLDS
 
 # --- Hyperparameters ------------------------------------------------------------------------------------------------
 

@@ -14,6 +14,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
 from rl2grid.errors import UsageError
+from rl2grid.mdp.constraint_table import CONSTRAINTS
 
 
 def check_environments(algorithm: str, envs: VectorEnv[Any, Any, Any], *, num_envs: int, mask_actions: bool) -> bool:
@@ -67,8 +68,7 @@ _OF_EPISODES: dict[str, tuple[str, ...]] = {
     "charts/score_margin": ("scores", "margin"),
     "charts/score_overload": ("scores", "overload"),
     "charts/score_topology": ("scores", "topology"),
-    "charts/cost_lsi": ("episode_costs", "LSI"),
-    "charts/cost_tlo": ("episode_costs", "TLO"),
+    **{f"charts/{constraint.column}": ("episode_costs", name) for name, constraint in CONSTRAINTS.items()},
 }
 """Metrics of an episode that ended, and where its last ``info`` tells them."""
 

@@ -18,7 +18,7 @@ from rl2grid.analysis.figures import STEPS_PER_DAY
 from rl2grid.analysis.lifetimes import kaplan_meier, lifetimes
 from rl2grid.analysis.result_tables import AGGREGATES
 from rl2grid.drawing.theme import BLUE, LIGHT, VERMILLION, Theme, style
-from rl2grid.mdp.constraints import THRESHOLDS
+from rl2grid.mdp.constraint_table import THRESHOLDS
 from rl2grid.records.methods import COSTS, Method, resampled_units
 from rl2grid.records.statistics import Estimate, estimate, probability_of_improvement, score_band, share_above
 

@@ -10,7 +10,7 @@ import numpy as np
 from rl2grid.analysis.lifetimes import kaplan_meier, lifetimes, log_rank
 from rl2grid.analysis.table import MISSING, Cell, Column, ResultTable, interval_cell, mean_cell, share_cell
 from rl2grid.envs.tasks import short_id
-from rl2grid.mdp.constraints import THRESHOLDS
+from rl2grid.mdp.constraint_table import CONSTRAINTS, THRESHOLDS
 from rl2grid.mdp.termination import GAME_OVER_TEXT, GameOver
 from rl2grid.records.methods import COSTS, Method, resampled_units
 from rl2grid.records.statistics import (
@@ -189,10 +189,11 @@ def constraint_table(methods: Methods) -> ResultTable:
                     mean_cell(safe[name][k], best=is_best),
                 ]
             rows.append((*_names(method), *cells))
+    meanings = "; ".join(f"{name}: {constraint.text}" for name, constraint in CONSTRAINTS.items())
     caption = (
         "Costs of an episode and the share of episodes that keep the threshold, alone and together with being "
-        "completed: a grid that is lost early costs little, too. LSI: load shedding and islanding; TLO: overloaded and "
-        f"disconnected lines. Plus or minus half of the 95% bootstrap interval over {_units(methods, methods)}."
+        f"completed: a grid that is lost early costs little, too. {meanings}. Plus or minus half of the 95% bootstrap "
+        f"interval over {_units(methods, methods)}."
     )
     return ResultTable("constraints", caption, columns, tuple(rows))
 

@@ -11,7 +11,7 @@ from matplotlib.ticker import FuncFormatter, PercentFormatter
 
 from rl2grid.analysis import figures
 from rl2grid.drawing.theme import LIGHT, VERMILLION, Theme, style
-from rl2grid.mdp.constraints import THRESHOLDS
+from rl2grid.mdp.constraint_table import CONSTRAINTS
 from rl2grid.records.metrics import SURVIVAL
 from rl2grid.records.trainings import TrainingCurve
 
@@ -32,8 +32,10 @@ SCORE_PANELS = (
 )
 COST_PANELS = (
     Panel(SURVIVAL, "Survival"),
-    Panel("charts/cost_lsi", "LSI cost of an episode", THRESHOLDS["LSI"]),
-    Panel("charts/cost_tlo", "TLO cost of an episode", THRESHOLDS["TLO"]),
+    *(
+        Panel(f"charts/{each.column}", f"{each.name} cost of an episode", each.threshold)
+        for each in CONSTRAINTS.values()
+    ),
 )
 
 Curves = Mapping[str, Sequence[TrainingCurve]]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rl2grid.envs.tasks import CONSTRAINTS
+from rl2grid.mdp.constraint_table import CONSTRAINTS
 from rl2grid.mdp.scores import SCORES
 from rl2grid.mdp.state import GridState
 from rl2grid.mdp.termination import GAME_OVER_TEXT, GameOver
@@ -28,7 +28,7 @@ class InfoKey:
     meaning: str
 
 
-_ALWAYS = "always"
+_ALWAYS, _COSTS = "always", tuple(CONSTRAINTS)
 INFO_KEYS: tuple[InfoKey, ...] = (
     InfoKey("scenario", "str", "", _ALWAYS, "id of the scenario being played"),
     InfoKey("start", "int", "row", _ALWAYS, "row of the scenario at which the episode began"),
@@ -40,11 +40,17 @@ INFO_KEYS: tuple[InfoKey, ...] = (
     InfoKey("n_steps", "int", "grid steps", _ALWAYS, "grid steps of this transition (in `reset`: before it)"),
     InfoKey("grid_steps", "int", "grid steps", _ALWAYS, "grid steps since the last seeded `reset`, over all episodes"),
     InfoKey("reward_components", "dict", "", _ALWAYS, "survive, overload, cost: sums over the transition"),
-    InfoKey("cost", "float", "", _ALWAYS, "cost of the task's constraint (without one: LSI + TLO), transition sum"),
-    InfoKey("costs", "dict", "", _ALWAYS, "LSI, TLO: sums over the transition"),
+    InfoKey(
+        "cost",
+        "float",
+        "",
+        _ALWAYS,
+        f"cost of the task's constraint (without one: {' + '.join(_COSTS)}), transition sum",
+    ),
+    InfoKey("costs", "dict", "", _ALWAYS, f"{', '.join(_COSTS)}: sums over the transition"),
     InfoKey("episode_return", "float", "", _ALWAYS, "rewards of the episode so far"),
     InfoKey("episode_components", "dict", "", _ALWAYS, "survive, overload, cost: sums over the episode so far"),
-    InfoKey("episode_costs", "dict", "", _ALWAYS, "LSI, TLO: sums over the episode so far"),
+    InfoKey("episode_costs", "dict", "", _ALWAYS, f"{', '.join(_COSTS)}: sums over the episode so far"),
     InfoKey("scores", "dict", "", _ALWAYS, "margin, overload, topology (paper, Section 5): means per grid step"),
     InfoKey("illegal", "bool", "", _ALWAYS, "the agent's action broke a rule and became do nothing"),
     InfoKey("ambiguous", "bool", "", _ALWAYS, "the agent's action had no single meaning and became do nothing"),
@@ -65,7 +71,7 @@ _GAME_OVER_WORDS = np.array(
 
 def episode_info(state: GridState, i: int, constraint: str | None) -> dict[str, Any]:
     """What the state alone tells about environment ``i``; see :data:`INFO_KEYS`."""
-    costs = _named(CONSTRAINTS, state.transition_costs[i])
+    costs = _named(_COSTS, state.transition_costs[i])
     step, length = int(state.step[i]), int(state.episode_length[i])
     reason = GameOver(int(state.game_over[i]))
     scored = max(step - int(state.terminated[i]), 1)  # the step of a game over has no flow to score
@@ -80,7 +86,7 @@ def episode_info(state: GridState, i: int, constraint: str | None) -> dict[str, 
         "costs": costs,
         "episode_return": float(state.episode_return[i]),
         "episode_components": _named(COMPONENTS, state.episode_components[i]),
-        "episode_costs": _named(CONSTRAINTS, state.episode_costs[i]),
+        "episode_costs": _named(_COSTS, state.episode_costs[i]),
         "scores": {name: value / scored for name, value in _named(SCORES, state.episode_scores[i]).items()},
         "illegal": bool(state.illegal[i]),
         "ambiguous": bool(state.ambiguous[i]),
@@ -92,7 +98,7 @@ def episode_info(state: GridState, i: int, constraint: str | None) -> dict[str, 
 
 def batch_info(state: GridState, constraint: str | None) -> dict[str, Any]:
     """:func:`episode_info` of all environments at once: arrays [n], dicts of arrays, and object [n] for words."""
-    costs = _named_columns(CONSTRAINTS, state.transition_costs)
+    costs = _named_columns(_COSTS, state.transition_costs)
     step = state.step.astype(np.int64)
     survived = np.maximum(step - state.terminated, 0)
     scored = np.maximum(step - state.terminated, 1)[:, np.newaxis]
@@ -107,7 +113,7 @@ def batch_info(state: GridState, constraint: str | None) -> dict[str, Any]:
         "costs": costs,
         "episode_return": state.episode_return.copy(),
         "episode_components": _named_columns(COMPONENTS, state.episode_components),
-        "episode_costs": _named_columns(CONSTRAINTS, state.episode_costs),
+        "episode_costs": _named_columns(_COSTS, state.episode_costs),
         "scores": _named_columns(SCORES, state.episode_scores / scored),
         "illegal": state.illegal.copy(),
         "ambiguous": state.ambiguous.copy(),

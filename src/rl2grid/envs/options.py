@@ -12,8 +12,9 @@ from dataclasses import dataclass, field, fields
 from typing import Any, TypeVar
 
 from rl2grid.engines import DISPATCHES, ENGINES, HEURISTICS
-from rl2grid.envs.tasks import CONSTRAINTS, Task, constraint_of
+from rl2grid.envs.tasks import Task, constraint_of
 from rl2grid.errors import UsageError, one_of
+from rl2grid.mdp.constraint_table import CONSTRAINTS
 from rl2grid.scenarios.splits import SPLITS
 
 _LITERAL = re.compile(r'``"?(.*?)"?``')

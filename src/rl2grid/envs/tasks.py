@@ -7,11 +7,10 @@ from dataclasses import dataclass
 
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid, System, find_system, load_grid, system_ids
+from rl2grid.mdp.constraint_table import CONSTRAINTS
 
 VERSION = 0
 """Version of every id; raised when anything that defines a result changes."""
-
-CONSTRAINTS: tuple[str, ...] = ("LSI", "TLO")
 
 
 @dataclass(frozen=True)
@@ -24,7 +23,7 @@ class Task:
     level: int
     """Difficulty of a topology task; 0 for continuous ones."""
     constraint: str | None
-    """Safety constraint of the task: None, ``"LSI"`` or ``"TLO"``."""
+    """Safety constraint of the task: None or a name of :data:`~rl2grid.mdp.constraint_table.CONSTRAINTS`."""
 
     @property
     def id(self) -> str:

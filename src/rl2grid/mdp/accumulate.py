@@ -12,16 +12,14 @@ A transition is one step of the agent and all steps of the heuristic to the next
 from __future__ import annotations
 
 from rl2grid.compile import jit
-from rl2grid.mdp.constraints import lsi_cost, tlo_cost, update_excused
+from rl2grid.mdp.constraints import step_costs, update_excused
 from rl2grid.mdp.scores import margin_score, overload_score, topology_score
 from rl2grid.mdp.state import (
     COST,
-    LSI,
     MARGIN_SCORE,
     OVERLOAD,
     OVERLOAD_SCORE,
     SURVIVE,
-    TLO,
     TOPOLOGY_SCORE,
     GridState,
 )
@@ -80,8 +78,9 @@ def accrue(
     _add(state.transition_components[i], state.episode_components[i], OVERLOAD, overload)
     _add(state.transition_components[i], state.episode_components[i], COST, cost)
     update_excused(state, i)
-    _add(state.transition_costs[i], state.episode_costs[i], LSI, lsi_cost(state, i))
-    _add(state.transition_costs[i], state.episode_costs[i], TLO, tlo_cost(state, i))
+    costs = step_costs(state, i)
+    for column in range(len(costs)):
+        _add(state.transition_costs[i], state.episode_costs[i], column, costs[column])
     state.episode_scores[i, MARGIN_SCORE] += margin_score(state, i)
     state.episode_scores[i, OVERLOAD_SCORE] += overload_score(state, i)
     state.episode_scores[i, TOPOLOGY_SCORE] += topology_score(state, i)

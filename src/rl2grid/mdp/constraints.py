@@ -1,4 +1,4 @@
-"""The two costs of the constrained tasks (paper, Section 3.3) and their thresholds.
+"""The costs of the constrained tasks (paper, Section 3.3); :mod:`rl2grid.mdp.constraint_table` lists them.
 
 LSI (load shedding and islanding) is charged once, by the reason of a game over. TLO (transmission line
 overload) counts lines that are overloaded or disconnected in a step, except those that the agent could not
@@ -12,9 +12,6 @@ import numpy as np
 from rl2grid.compile import jit
 from rl2grid.mdp.state import GridState
 from rl2grid.mdp.termination import GameOver
-
-THRESHOLDS: dict[str, float] = {"LSI": 0.0, "TLO": 50.0}
-"""What the sum of a cost over an episode may reach. The paper's text; its table and figure swap the two."""
 
 _NONE, _DIVERGENCE, _DISPATCH = int(GameOver.NONE), int(GameOver.DIVERGENCE), int(GameOver.DISPATCH)
 
@@ -65,3 +62,9 @@ def tlo_cost(state: GridState, i: int) -> float:
         if not state.line_status[i, line] or state.rho[i, line] > np.float32(1.0):
             count += 1
     return np.float64(count)
+
+
+@jit
+def step_costs(state: GridState, i: int) -> tuple[float, ...]:
+    """The costs of a step in the order of :data:`rl2grid.mdp.constraint_table.CONSTRAINTS`."""
+    return lsi_cost(state, i), tlo_cost(state, i)

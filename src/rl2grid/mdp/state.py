@@ -13,12 +13,11 @@ import numpy as np
 from rl2grid.arrays import F32, F64, I32, Flags
 from rl2grid.grids import Grid
 from rl2grid.grids.axes import axis_sizes
+from rl2grid.mdp.constraint_table import CONSTRAINTS
 from rl2grid.structures import Role, allocate, constant, fields_of, row
 
 SURVIVE, OVERLOAD, COST = 0, 1, 2
 """Columns of the reward components."""
-LSI, TLO = 0, 1
-"""Columns of the costs."""
 MARGIN_SCORE, OVERLOAD_SCORE, TOPOLOGY_SCORE = 0, 1, 2
 """Columns of the scores of the paper's Section 5."""
 
@@ -97,12 +96,12 @@ class GridState(NamedTuple):
     transition_discounted: Annotated[F64, row("", "sum of gamma^k times the reward of its step k")]
     transition_discount: Annotated[F64, row("", "gamma^n_steps, the factor of the next step")]
     transition_components: Annotated[F64, row("component", "SURVIVE, OVERLOAD, COST")]
-    transition_costs: Annotated[F64, row("cost", "LSI, TLO")]
+    transition_costs: Annotated[F64, row("cost", ", ".join(CONSTRAINTS))]
 
     # Sums over the episode.
     episode_return: Annotated[F64, row("", "sum of the rewards")]
     episode_components: Annotated[F64, row("component", "SURVIVE, OVERLOAD, COST")]
-    episode_costs: Annotated[F64, row("cost", "LSI, TLO")]
+    episode_costs: Annotated[F64, row("cost", ", ".join(CONSTRAINTS))]
     episode_scores: Annotated[F64, row("score", "margin, overload, topology: sums over steps")]
     decisions: Annotated[I32, row("", "agent actions")]
 
@@ -121,5 +120,5 @@ def new_state(grid: Grid, n: int) -> GridState:
         "max_changes": np.array([grid.rules.max_line_changes, grid.rules.max_sub_changes], np.int32),
     }
     shared = {name: getattr(grid, name) for name in fields_of(GridState, Role.CONSTANT) if name not in own}
-    sizes = axis_sizes(grid) | {"component": 3, "cost": 2, "score": 3}
+    sizes = axis_sizes(grid) | {"component": 3, "cost": len(CONSTRAINTS), "score": 3}
     return allocate(GridState, sizes, n, **own, **shared)

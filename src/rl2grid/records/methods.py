@@ -9,13 +9,13 @@ import numpy as np
 
 from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
-from rl2grid.mdp.constraints import THRESHOLDS
+from rl2grid.mdp.constraint_table import CONSTRAINTS, THRESHOLDS
 from rl2grid.records.episodes import Episode
 from rl2grid.records.evaluations import Evaluation, check_comparable
 from rl2grid.records.statistics import Scores, Unit
 from rl2grid.records.summary import by_scenario, safe_episodes
 
-COSTS: dict[str, str] = {"LSI": "cost_lsi", "TLO": "cost_tlo"}
+COSTS: dict[str, str] = {name: constraint.column for name, constraint in CONSTRAINTS.items()}
 """Column of each cost in the rows of episodes."""
 _OF_THE_TASK = frozenset({"task", "grid_hash", "scenario_pack_hash", "action_set_hash", "constraint"})
 _OF_THE_AGENT = frozenset({"agent", "agent_identity", "heuristic", "normalize"})

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rl2grid.arrays import F64
-from rl2grid.mdp.constraints import THRESHOLDS
+from rl2grid.mdp.constraint_table import THRESHOLDS
 from rl2grid.records.episodes import Episode
 from rl2grid.records.statistics import Estimate, Statistic, interquartile_mean, mean, stratified_bootstrap
 

@@ -43,11 +43,11 @@ from rl2grid.algorithms.registry import (
 from rl2grid.algorithms.trainer import Trainer
 from rl2grid.envs.options import TaskOptions
 from rl2grid.envs.registration import register_all
-from rl2grid.envs.tasks import CONSTRAINTS, Task, constraint_of, find_task
+from rl2grid.envs.tasks import Task, constraint_of, find_task
 from rl2grid.errors import UsageError, one_of
 from rl2grid.evaluation.protocol import evenly_spread
 from rl2grid.mdp.actions import action_set_hash
-from rl2grid.mdp.constraints import THRESHOLDS
+from rl2grid.mdp.constraint_table import CONSTRAINTS, THRESHOLDS
 from rl2grid.records.trainings import RUN_FILE, create_run_folder, read_configuration
 from rl2grid.records.versions import library_versions
 from rl2grid.scenarios.library import check_in_split, generator_version, scenario_pack_hash
@@ -135,7 +135,7 @@ def find_limits(args: RunArgs) -> dict[str, float]:
         limits = algorithm.find_limits(args.hyperparameters, constraint)
         for name in limits:
             if name not in CONSTRAINTS:
-                raise one_of("Constraint", name, CONSTRAINTS)
+                raise one_of("Constraint", name, tuple(CONSTRAINTS))
         return limits
     return {constraint: THRESHOLDS[constraint]} if constraint else {}
 
