@@ -1,6 +1,7 @@
 """The page of the tasks: its tables and pictures are made from the package while the site is built.
 
-``docs/tasks.md`` names what is to be put in, with ``<!-- tasks: overview -->`` and ``<!-- tasks: <grid> -->``.
+``docs/tasks.md`` names what is to be put in, with ``<!-- tasks: overview -->``, ``<!-- tasks: keywords -->`` and
+``<!-- tasks: <grid> -->``.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from mkdocs.structure.pages import Page
 
 from rl2grid.drawing.grid_drawing import GridDrawing, Scene, reference_scene
 from rl2grid.drawing.theme import DARK, LIGHT, Theme, style
+from rl2grid.envs.options import option_texts, options_without
 from rl2grid.envs.tasks import all_tasks
 from rl2grid.grids import GRID_IDS, Grid, load_grid
 from rl2grid.grids.grid import Rules
@@ -53,6 +55,8 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     results = json.loads(RESULTS.read_text(encoding="utf-8"))
 
     def fill(mark: re.Match[str]) -> str:
+        if mark[1] == "keywords":
+            return _keywords()
         if mark[1] == "overview":
             return _overview(results)
         return _of_grid(load_grid(mark[1]), results[mark[1]])
@@ -99,6 +103,16 @@ def _overview(results: dict[str, Any]) -> str:
             f"| {grid.n_gen}, {grid.n_load}, {grid.n_storage} | {opponent} | {len(grid.level_sizes)} "
             f"| {_survival(results[grid_id])} |"
         )
+    return "\n".join(rows)
+
+
+def _keywords() -> str:
+    texts = option_texts()
+    rows = ["| keyword | default | values | meaning |", "|---|---|---|---|"]
+    for option in options_without():
+        choices = option.metadata.get("choices", ())
+        values = ", ".join(f"`{choice!r}`" for choice in choices)
+        rows.append(f"| `{option.name}` | `{option.default!r}` | {values} | {texts[option.name]} |")
     return "\n".join(rows)
 
 

@@ -10,6 +10,8 @@ from documentation import ROOT
 from mkdocs.commands.build import build
 from mkdocs.config import load_config
 
+from rl2grid.envs.options import OPTION_NAMES
+
 FETCHED = re.compile(r"""<(?:script|link|img)\b[^>]*?(?:src|href)=["']?(https?:[^"'\s>]+)""")
 
 
@@ -29,6 +31,11 @@ def site(tmp_path_factory):
 def test_no_page_fetches_anything(site):
     fetched = {page.name: FETCHED.findall(page.read_text(encoding="utf-8")) for page in site.rglob("*.html")}
     assert {name: addresses for name, addresses in fetched.items() if addresses} == {}
+
+
+def test_the_page_of_the_tasks_describes_every_keyword(site):
+    page = (site / "tasks.html").read_text(encoding="utf-8")
+    assert all(f"<td><code>{name}</code></td>" in page for name in OPTION_NAMES)
 
 
 def test_formulas_are_mathml(site):
