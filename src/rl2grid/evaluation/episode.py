@@ -12,6 +12,7 @@ import gymnasium
 from rl2grid.agents.agent import Action, Agent, Info, RandomizedAgent, no_intervention
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.collapse import COMPLETED, collapse, overloaded_lines
+from rl2grid.mdp.constraint_table import CONSTRAINTS
 from rl2grid.mdp.termination import GameOver
 from rl2grid.records.episodes import Episode
 
@@ -55,7 +56,7 @@ def play_episode(
     options = {"scenario": scenario, "start": start}
     observation, info = env.reset(seed=environment_seed(scenario, seed), options=options)
     agent.reset(0)
-    totals: dict[str, Any] = dict.fromkeys(_TOTALS, 0.0)
+    totals: dict[str, Any] = dict.fromkeys((*_TOTALS, *(each.column for each in CONSTRAINTS.values())), 0.0)
     decisions = illegal = ambiguous = 0
     over = False
     played: Any = env.unwrapped
@@ -110,7 +111,7 @@ def environment_seed(scenario: str, seed: int) -> int:
     return (zlib.crc32(scenario.encode()) << 31) + seed
 
 
-_TOTALS = ("episode_return", "return_survive", "return_overload", "return_cost", "cost_lsi", "cost_tlo")
+_TOTALS = ("episode_return", "return_survive", "return_overload", "return_cost")
 
 
 def _add(totals: dict[str, Any], reward: float, info: Info) -> None:
@@ -119,8 +120,8 @@ def _add(totals: dict[str, Any], reward: float, info: Info) -> None:
     totals["return_survive"] += components["survive"]
     totals["return_overload"] += components["overload"]
     totals["return_cost"] += components["cost"]
-    totals["cost_lsi"] += costs["LSI"]
-    totals["cost_tlo"] += costs["TLO"]
+    for name, constraint in CONSTRAINTS.items():
+        totals[constraint.column] += costs[name]
 
 
 def _episode_number(scenario: str, start: int) -> int:
