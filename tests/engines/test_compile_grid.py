@@ -14,6 +14,7 @@ from grid2op.Opponent import NeverAttackBudget, RandomLineOpponent
 from grid2op.Parameters import Parameters
 from grid2op.Rules import AlwaysLegal
 from grid2op.VoltageControler import ControlVoltageFromFile
+from grid2op_copies import copied_environment
 from lightsim2grid.algorithm import AlgorithmType
 
 from rl2grid.engines.reference.compile_grid import compile_grid, compiled_path, load_compiled
@@ -39,7 +40,7 @@ def folder(tmp_path, monkeypatch):
 @pytest.fixture
 def small():
     """An environment of five substations."""
-    environment = make_environment("rte_case5_example")
+    environment = copied_environment("rte_case5_example")
     yield environment
     environment.close()
 
@@ -56,7 +57,7 @@ def assert_same(one: System, other: System) -> None:
 @pytest.mark.parametrize("grid_id", GRID_IDS)
 def test_benchmark_grids_compile_to_what_is_shipped(grid_id):
     shipped = load_grid(grid_id)
-    environment = make_environment(shipped.bundled_names[0])
+    environment = copied_environment(shipped.bundled_names[0])
     compiled = compile_grid(environment)
     environment.close()
     ours = {"id", "grid2op_name", "bundled_names", "level_sizes", "load_p_max"}
@@ -76,7 +77,7 @@ def test_benchmark_grids_compile_to_what_is_shipped(grid_id):
 
 @pytest.mark.parametrize(("name", "sizes"), [("rte_case5_example", (5, 8, 2, 3)), ("rte_case118_example", None)])
 def test_foreign_environments_compile(name, sizes):
-    environment = make_environment(name)
+    environment = copied_environment(name)
     compiled = compile_grid(environment)
     grid, network = compiled.grid, compiled.network
     assert (grid.id, grid.grid2op_name, grid.bundled_names) == (name, name, ())
@@ -112,7 +113,7 @@ def test_hash_names_what_was_read_and_nothing_else(small, folder):
 def test_compiling_leaves_the_environment_as_it_was():
     played = []
     for compiles in (False, True):
-        environment = make_environment("l2rpn_icaps_2021")
+        environment = copied_environment("l2rpn_icaps_2021")
         environment.seed(3)
         environment.reset()
         rows = []
@@ -284,7 +285,7 @@ def test_environments_with_other_features_are_refused(small, problem, folder):
 
 
 def test_budget_of_an_attacker_must_be_the_usual_one():
-    environment = make_environment("l2rpn_icaps_2021")
+    environment = copied_environment("l2rpn_icaps_2021")
     environment._oppSpace.compute_budget = NeverAttackBudget(PowerlineSetAction)
     with pytest.raises(UsageError, match="the budget of its opponent is NeverAttackBudget, only BaseActionBudget"):
         compile_grid(environment)
@@ -328,7 +329,7 @@ MODEL_CHANGES = {
 
 @pytest.fixture(scope="module")
 def stored_energy():
-    environment = make_environment("educ_case14_storage")
+    environment = copied_environment("educ_case14_storage")
     yield environment
     environment.close()
 

@@ -15,6 +15,7 @@ import warnings
 import numpy as np
 import pytest
 from grid2op.Parameters import Parameters
+from grid2op_copies import made_once
 
 from rl2grid.engines.reference.opponent import OpponentBridge, install_opponent
 from rl2grid.grids import load_grid
@@ -122,12 +123,12 @@ def configure(space, config):
         area._recovery_minimum_duration = config.minimum_duration
 
 
-def make_environment(name):
+def make_environment(grid_id):
     import grid2op
     from grid2op.Action import PlayableAction
     from lightsim2grid import LightSimBackend
 
-    parameters = Parameters()
+    name, parameters = load_grid(grid_id).bundled_names[0], Parameters()
     parameters.NO_OVERFLOW_DISCONNECTION = True  # episodes last longer
     parameters.NB_TIMESTEP_COOLDOWN_LINE = parameters.NB_TIMESTEP_COOLDOWN_SUB = 3
     with warnings.catch_warnings():
@@ -137,16 +138,19 @@ def make_environment(name):
         )
 
 
+copied_environment = made_once(make_environment, lambda grid_id: grid_id)
+
+
 @functools.cache
 def original_environment(grid_id):
     """With Grid2Op's opponent."""
-    return make_environment(load_grid(grid_id).bundled_names[0])
+    return copied_environment(grid_id)
 
 
 @functools.cache
 def bridged_environment(grid_id):
     """To install ours in."""
-    return make_environment(load_grid(grid_id).bundled_names[0])
+    return copied_environment(grid_id)
 
 
 @dataclasses.dataclass

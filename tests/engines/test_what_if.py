@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from grid2op_copies import copied_environment
 
 from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.engines.native.what_if import (
@@ -163,8 +164,6 @@ def test_outages_are_the_switches_of_closed_lines(grid_id: str) -> None:
 @pytest.mark.parametrize("grid_id", ["bus14", "bus36-MO-v0", "bus118-M"])
 def test_outages_are_those_of_lightsim2grid(grid_id: str) -> None:
     """Loadings within 1e-4 of the thermal limit; no flow where it finds none or would cut something off."""
-    from rl2grid.engines.reference.extract import make_environment
-
     engine = engine_of(grid_id)
     grid = engine.grid
     engine.reset(0, plan_episode(grid, "train", 0, 0))
@@ -174,7 +173,7 @@ def test_outages_are_those_of_lightsim2grid(grid_id: str) -> None:
 
     from lightsim2grid.contingencyAnalysis import ContingencyAnalysisCPP
 
-    backend = make_environment(grid.bundled_names[0]).backend
+    backend = copied_environment(grid.bundled_names[0]).backend
     model, recipe = backend._grid.copy(), (backend.max_it, backend.tol)
     model.update_topo(np.ones(grid.dim_topo, bool), snapshot.topo_vect)
     model.update_gens_p(np.ones(grid.n_gen, bool), snapshot.gen_p)

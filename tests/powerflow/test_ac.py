@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from grid2op_copies import copied_environment
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rl2grid.engines.reference.extract import make_environment
 from rl2grid.grids import GRID_IDS, Grid, load_grid
 from rl2grid.powerflow.ac import (
     CONVERGED,
@@ -60,7 +60,7 @@ class Reference:
 
     def __init__(self, grid_id: str) -> None:
         self.grid = load_grid(grid_id)
-        backend = make_environment(self.grid.bundled_names[0]).backend
+        backend = copied_environment(self.grid.bundled_names[0]).backend
         self._model = backend._grid.copy()
         self._recipe = (backend.max_it, backend.tol)
 

@@ -5,8 +5,9 @@ from importlib import resources
 
 import numpy as np
 import pytest
+from grid2op_copies import copied_environment
 
-from rl2grid.engines.reference.extract import SOURCES, describe_network, make_environment, read_initial_network
+from rl2grid.engines.reference.extract import SOURCES, describe_network, read_initial_network
 from rl2grid.errors import UsageError
 from rl2grid.grids import GRID_IDS, load_grid
 from rl2grid.grids.network import network_from_record
@@ -17,7 +18,7 @@ from rl2grid.powerflow.model import load_network, network_hash
 def live(request):
     """Grid, network and the environment in its first row, all elements on busbar 1."""
     grid = load_grid(request.param)
-    environment = make_environment(grid.bundled_names[0])
+    environment = copied_environment(grid.bundled_names[0])
     yield grid, load_network(grid), environment
     environment.close()
 

@@ -1,0 +1,15 @@
+"""What all tests share."""
+
+import pytest
+from grid2op_copies import made_once
+
+from rl2grid.engines.reference import engine
+
+
+@pytest.fixture(scope="session", autouse=True)
+def grid2op_environments_are_made_once():
+    """Reference engines of this process copy the first Grid2Op environment of their kind."""
+    with pytest.MonkeyPatch.context() as patch:
+        make = made_once(engine._make_grid2op, lambda grid, scenario, dispatch: (grid.id, dispatch))
+        patch.setattr(engine, "_make_grid2op", make)
+        yield
