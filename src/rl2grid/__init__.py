@@ -88,10 +88,10 @@ def train(
     from rl2grid.training import runs
     from rl2grid.training.validation import find_validator
 
-    task_id = find_task(task).id
+    chosen = find_task(task)
     args = runs.RunArgs(
-        task=task_id,
-        hyperparameters=runs.hyperparameters(algorithm, task_id, preset, **(hyperparameters or {})),
+        task=chosen,
+        hyperparameters=runs.hyperparameters(algorithm, chosen, preset, **(hyperparameters or {})),
         algorithm=algorithm,
         folder=None if folder is None else Path(folder),
         env_keywords=options,
@@ -138,7 +138,7 @@ def evaluate(
 
     return protocol.evaluate(
         agent,
-        find_task(task).id,
+        task,
         split=split,
         scenarios=scenarios,
         seeds=seeds,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rl2grid.envs.tasks import find_task, short_id
+from rl2grid.envs.tasks import Task, find_task, short_id
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.protocol import AS_TRAINED, evaluate
 from rl2grid.records.evaluations import identity_hash
