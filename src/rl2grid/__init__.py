@@ -133,7 +133,6 @@ def evaluate(
     Raises:
         UsageError: the request cannot be met, or ``output`` holds another evaluation; nothing was written.
     """
-    from rl2grid.envs.tasks import find_task
     from rl2grid.evaluation import protocol
 
     return protocol.evaluate(
