@@ -98,7 +98,7 @@ def _test(options: argparse.Namespace) -> int:
 
     for subject in [find_subject(text) for text in options.subjects]:
         if subject.digest in read_ledger(options.ledger):
-            print(f"{subject.agent} on {subject.task} has had its test: see {options.ledger.name}.")
+            print(f"{subject.agent} on {subject.task.id} has had its test: see {options.ledger.name}.")
             continue
         enter(options.ledger, play_test(subject))
     return 0
@@ -118,7 +118,7 @@ def _verify_tests(ledger: Path, texts: Sequence[str]) -> int:
     for subject in [find_subject(text) for text in texts]:
         stored = read_ledger(ledger).get(subject.digest)
         if stored is None:
-            raise UsageError(f"The ledger has no test of {str(subject.agent)!r} on {subject.task} to compare with.")
+            raise UsageError(f"The ledger has no test of {str(subject.agent)!r} on {subject.task.id} to compare with.")
         difference = verify_test(stored, subject)
         different += difference is not None
         words = f"differs in {difference}" if difference else "the same, bit for bit"
