@@ -86,7 +86,7 @@ def test_a_failed_cell_is_told_and_the_others_are_finished(capsys, file: str, tm
         def submit(self, folder: Path) -> Job:
             return Job(folder)
 
-    monkeypatch.setattr(study_run, "_write_episodes", lambda path, states: path.write_text("cell\n"))
+    monkeypatch.setattr(study_run, "write_study_episodes", lambda folder, cells: None)
     monkeypatch.setattr(study_run, "_POLL_SECONDS", 0.01)
     monkeypatch.setattr("rl2grid.studies.backends.make_backend", lambda *_: Backend())
     output = tmp_path / "out"

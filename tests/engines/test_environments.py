@@ -10,7 +10,7 @@ import pytest
 from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.engines.native.environments import Environments, new_environments
 from rl2grid.grids import GRID_IDS, load_grid
-from rl2grid.mdp.actions import StepAction, full_catalogue
+from rl2grid.mdp.actions import DO_NOTHING, full_catalogue
 from rl2grid.powerflow.model import load_network
 from rl2grid.scenarios.episodes import plan_episode
 from rl2grid.structures import Role, declaration_of, fields_of
@@ -41,12 +41,12 @@ def test_a_step_needs_nothing_of_what_is_declared_as_passing(grid_id):
     catalogue, random = full_catalogue(grid), np.random.default_rng(4)
     engines = [NativeEngine(grid, 2) for _ in range(2)]
     steps = 0
-    for number in range(4):
+    for number in range(6):
         for engine in engines:
             engine.reset(1, plan_episode(grid, "bundled", number, 0, start=40))
         while not engines[0].state.terminated[1] and steps < 20 * (number + 1):
             steps += 1
-            action = catalogue[int(random.integers(len(catalogue)))] if steps % 3 == 0 else StepAction(0)
+            action = catalogue[int(random.integers(len(catalogue)))] if steps % 3 == 0 else DO_NOTHING
             forget(engines[1], random)
             for engine in engines:
                 engine.step(1, action)

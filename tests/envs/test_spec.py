@@ -16,7 +16,7 @@ from rl2grid.envs.spec import Spec, spec_from_state, spec_of, task_spec
 from rl2grid.envs.tasks import all_tasks, find_task
 from rl2grid.errors import UsageError
 from rl2grid.grids import GRID_IDS
-from rl2grid.mdp.actions import ActionCatalogue, ActionKind, ContinuousLayout
+from rl2grid.mdp.actions import DO_NOTHING, ActionCatalogue, ContinuousLayout
 from rl2grid.mdp.features import physical_scale
 
 TASKS = [f"{grid}-{kind}" for grid in GRID_IDS for kind in ("T0", "R")]
@@ -47,7 +47,7 @@ def test_actions_are_those_of_the_task():
     discrete, continuous = task_spec(find_task("bus36-M-T1")), task_spec(find_task("bus118-MOB-v0-R"))
     assert isinstance(discrete.actions, ActionCatalogue)
     assert len(discrete.actions) == discrete.action_size == 302
-    assert discrete.actions[0].kind == ActionKind.NOTHING
+    assert discrete.actions[0] == DO_NOTHING
     assert isinstance(continuous.actions, ContinuousLayout)
     assert continuous.actions.size == continuous.action_size == 69
 

@@ -55,7 +55,7 @@ IDENTITY = {
 
 @pytest.fixture(autouse=True)
 def _workers_find_the_fake_grid(monkeypatch: pytest.MonkeyPatch) -> None:
-    paths = [str(Path(__file__).parent), str(Path(__file__).parents[2] / "src"), os.environ.get("PYTHONPATH", "")]
+    paths = [str(Path(__file__).parents[1]), str(Path(__file__).parents[2] / "src"), os.environ.get("PYTHONPATH", "")]
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, paths)))
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from rl2grid.grids import GRID_IDS, Grid, load_grid
 from rl2grid.handles import Handle
-from rl2grid.mdp.actions import full_catalogue, moved_elements
+from rl2grid.mdp.actions import full_catalogue, mask_integer, moved_elements
 from rl2grid.mdp.state import new_state
 from rl2grid.mdp.termination import GameOver, game_over_reason
 from rl2grid.powerflow import batch
@@ -130,8 +130,9 @@ def case_of(grid_id: str) -> Case:
 
 
 def assert_like_cold_flows(case: Case, snapshot: Snapshot, changes: Changes, outcomes: batch.ChangeOutcomes) -> None:
-    for k, change in enumerate(zip(*changes, strict=True)):
-        reason, rho = case.solve_cold(snapshot, case.topology_after(snapshot, *map(int, change)))
+    for k, (kind, target, words) in enumerate(zip(*changes, strict=True)):
+        change = int(kind), int(target), mask_integer(words)
+        reason, rho = case.solve_cold(snapshot, case.topology_after(snapshot, *change))
         assert GameOver(outcomes.verdict[k]) == reason, change
         np.testing.assert_allclose(outcomes.rho[k], rho, rtol=0, atol=LOADING_TOLERANCE, err_msg=str(change))
         assert outcomes.worst_loading[k] == outcomes.rho[k].max()

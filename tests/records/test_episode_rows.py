@@ -14,7 +14,7 @@ from rl2grid.records.evaluations import labels
 HEADER = (
     "task,agent,heuristic,split,scenario,seed,start,episode_length,grid_steps,decisions,survival,completed,game_over,"
     "last_overloads,last_outages,last_cut_off,episode_return,return_survive,return_overload,return_cost,cost_lsi,"
-    "cost_tlo,score_margin,score_overload,score_topology,illegal,ambiguous,wall_time_s,engine,scenario_pack_hash,"
+    "cost_tlo,score_margin,score_overload,score_topology,illegal,ambiguous,foresight,wall_time_s,engine,scenario_pack_hash,"
     "action_set_hash,agent_hash,identity"
 )
 """Of the files that are stored already."""
@@ -31,7 +31,7 @@ def test_files_keep_their_columns():
 def test_a_row_keeps_its_bytes():
     assert format_row(episode("may", 3, 1 / 3, last_overloads="3 17")) == (
         "rl2grid/bus14-T0-v0,someone,none,validation,may,3,0,100,34,7,0.3333333333333333,false,DIVERGENCE,3 17,4,,30.0,"
-        "33.33333333333333,-0.3333333333333333,-5.0,1.0,10.0,11.0,-0.25,-2.0,1,0,0.5,reference,pack,actions,,identity\n"
+        "33.33333333333333,-0.3333333333333333,-5.0,1.0,10.0,11.0,-0.25,-2.0,1,0,0,0.5,reference,pack,actions,,identity\n"
     )
 
 
@@ -43,7 +43,9 @@ def test_a_hash_of_facts_stays_what_it_was():
 def test_every_column_says_what_it_means():
     assert all(column.meaning and column.type in (str, int, float, bool) for column in COLUMNS)
     assert [column.name for column in COLUMNS if column.origin is Origin.CLOCK] == ["wall_time_s"]
-    assert {*LABELS, *FACTS} == {column for column in COLUMNS if column.name != "wall_time_s"}
+    assert [column.name for column in COLUMNS if column.origin is Origin.AGENT] == ["foresight"]
+    of_nobody_else = {column for column in COLUMNS if column.origin not in (Origin.CLOCK, Origin.AGENT)}
+    assert {*LABELS, *FACTS} == of_nobody_else
 
 
 def test_an_evaluation_decides_exactly_the_labels():
@@ -54,6 +56,6 @@ def test_an_evaluation_decides_exactly_the_labels():
 
 def test_what_was_played_is_never_left_out():
     optional = {each.name for each in fields(Episode) if each.default is not MISSING}
-    assert optional == {column.name for column in LABELS}
+    assert optional == {*(column.name for column in LABELS), "foresight"}
     with pytest.raises(TypeError, match="survival"):
         Episode(**{name: value for name, value in vars(episode()).items() if name != "survival"})

@@ -380,7 +380,8 @@ import os, sys
 from pathlib import Path
 import torch
 from test_runs import falling, request, toy_envs
-from rl2grid.algorithms import checkpoint, metrics
+from rl2grid.algorithms import checkpoint
+from rl2grid.records import metrics
 from rl2grid.algorithms.registry import find_algorithm
 from rl2grid.training import runs
 
@@ -421,14 +422,14 @@ class Csv:
     def flush(self): self.file.flush()
     def close(self): self.file.close()
 
-def writer(self, *arguments, original=metrics.MetricsWriter.__init__, **keywords):
+def writer(self, *arguments, original=metrics.MetricsFile.__init__, **keywords):
     original(self, *arguments, **keywords)
     self._file = Csv(self._file)
     self._csv = metrics.csv.writer(self._file, lineterminator="\\n")
 
 torch.save = save
 checkpoint.os.replace = replace
-metrics.MetricsWriter.__init__ = writer
+metrics.MetricsFile.__init__ = writer
 # Iterations as long as those of a small task, for the kills from outside.
 iterate = find_algorithm("ppo").trainer.iterate
 def slow(self):

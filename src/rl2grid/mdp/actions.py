@@ -93,10 +93,8 @@ class StepAction(_Parts):
     order of the changes has no meaning: lines are switched first, then elements moved, then substations
     restored, as Grid2Op merges an action.
 
-    Args:
-        changes: at most one of each line and each substation.
-        values: redispatch, curtailment and storage, float32 [continuous], see :func:`decode_continuous`; None:
-            no injection.
+    ``changes`` are at most one of each line and each substation. ``values`` are redispatch, curtailment and storage,
+    float32 [continuous], see :func:`decode_continuous`; None: no injection.
 
     Raises:
         UsageError: two changes of one line or substation, or a change that changes nothing.
