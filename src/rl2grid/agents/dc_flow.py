@@ -23,8 +23,9 @@ _LEAST_SHARE = 0.5
 """Share of a line's apparent-power limit that active power may always use, however much reactive power flows."""
 _LEAST_LOADING = 0.05
 """Loadings below say nothing about the limit in MW."""
-LARGEST_TABLE = 2**27
-"""Numbers of a table of sensitivities: 1 GiB. The equations behind it are solved anew at every operating point."""
+LARGEST_TABLE = 2**23
+"""Numbers of a table of sensitivities. The equations behind it are solved anew at every operating point, and what
+agents make of it takes a multiple: at half of this a decision takes a minute and up to 10 GB."""
 
 
 class DcPoint(NamedTuple):
