@@ -12,7 +12,6 @@ from rl2grid.engines import ENGINES
 from rl2grid.envs.info import INFO_KEYS
 from rl2grid.envs.tasks import all_tasks
 from rl2grid.errors import UsageError
-from rl2grid.grids import GRID_IDS
 from rl2grid.scenarios.library import list_scenarios
 
 BOTH_ENGINES = pytest.mark.parametrize("engine", ENGINES)
@@ -33,10 +32,17 @@ def checked(task_id, engine):
 
 @pytest.mark.parametrize(
     ("engine", "grid_id"),
-    [*(("native", grid_id) for grid_id in GRID_IDS), ("reference", "bus14"), ("reference", "bus118-MOB-v1")],
+    [
+        ("native", "bus14"),
+        ("native", "bus36-MO-v0"),
+        ("native", "bus118-MOB-v1"),
+        ("reference", "bus14"),
+        ("reference", "bus118-MOB-v1"),
+    ],
 )
 @pytest.mark.parametrize("kind", ["T0", "R"])
 def test_passes_the_environment_checker(engine, grid_id, kind):
+    """A grid without opponent, with one, and with storage; the longer test below checks all tasks."""
     checked(f"rl2grid/{grid_id}-{kind}-v0", engine)
 
 

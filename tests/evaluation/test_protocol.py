@@ -55,7 +55,8 @@ IDENTITY = {
 
 @pytest.fixture(autouse=True)
 def _workers_find_the_fake_grid(monkeypatch: pytest.MonkeyPatch) -> None:
-    paths = [str(Path(__file__).parents[1]), str(Path(__file__).parents[2] / "src"), os.environ.get("PYTHONPATH", "")]
+    folders = Path(__file__).parents
+    paths = [*map(str, folders[:2]), str(folders[2] / "src"), os.environ.get("PYTHONPATH", "")]
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, paths)))
 
 
