@@ -14,7 +14,10 @@ from rl2grid.arrays import F32, F64, I32, Flags
 from rl2grid.handles import Handle, opener
 from rl2grid.structures import allocate, blank_row, constant, copy_row, episode, row, scratch, workspace
 
-DTYPES = ("bool", "int8", "int32", "int64", "uint16", "uint32", "uint64", "float32", "float64")
+DTYPES = (
+    *("bool", "int32", "uint64", "float32", "float64"),
+    *(pytest.param(dtype, marks=pytest.mark.slow) for dtype in ("int8", "int64", "uint16", "uint32")),
+)
 SIZES = {"a": 5, "b": 3, "c": 4}
 
 

@@ -142,14 +142,14 @@ def test_works_as_a_module_and_says_its_version():
 def test_an_evaluation_names_its_engine_and_may_use_the_other(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for flags, folder in (
-        ([], "validation-4-months"),
-        (["--engine", "reference", "--workers", "0"], "validation-4-months-engine-reference"),
+        ([], "validation-2-months"),
+        (["--engine", "reference", "--workers", "0"], "validation-2-months-engine-reference"),
     ):
-        assert main(["evaluate", "do-nothing", "bus14-T0", "--months", "4", *flags]) == 0
+        assert main(["evaluate", "do-nothing", "bus14-T0", "--months", "2", *flags]) == 0
         assert f"{folder}/episodes.csv" in capsys.readouterr().out.replace("\n", "")
     native, reference = (
         load_evaluation(Path("runs/bus14-T0-v0-do-nothing/evaluation") / folder)
-        for folder in ("validation-4-months", "validation-4-months-engine-reference")
+        for folder in ("validation-2-months", "validation-2-months-engine-reference")
     )
     assert [result.identity["engine"] for result in (native, reference)] == ["native", "reference"]
     assert "--engine" not in native.command

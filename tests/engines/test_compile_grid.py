@@ -15,6 +15,7 @@ from grid2op.Parameters import Parameters
 from grid2op.Rules import AlwaysLegal
 from grid2op.VoltageControler import ControlVoltageFromFile
 from grid2op_copies import copied_environment
+from grids_of_tests import SHORTER_OR_ALL
 from lightsim2grid.algorithm import AlgorithmType
 
 from rl2grid.engines.reference.compile_grid import compile_grid, compiled_path, load_compiled
@@ -26,7 +27,7 @@ from rl2grid.engines.reference.supported import (
     require_supported_model,
 )
 from rl2grid.errors import UsageError
-from rl2grid.grids import GRID_IDS, System, load_grid
+from rl2grid.grids import System, load_grid
 from rl2grid.mdp.actions import full_catalogue
 from rl2grid.powerflow.model import load_network
 
@@ -54,7 +55,7 @@ def assert_same(one: System, other: System) -> None:
     assert one.hash == other.hash == one.grid.hash == other.grid.hash
 
 
-@pytest.mark.parametrize("grid_id", GRID_IDS)
+@pytest.mark.parametrize("grid_id", SHORTER_OR_ALL)
 def test_benchmark_grids_compile_to_what_is_shipped(grid_id):
     shipped = load_grid(grid_id)
     environment = copied_environment(shipped.bundled_names[0])
@@ -75,7 +76,10 @@ def test_benchmark_grids_compile_to_what_is_shipped(grid_id):
     assert compiled.grid.load_p_max.max() > 0.5 * shipped.load_p_max.max()
 
 
-@pytest.mark.parametrize(("name", "sizes"), [("rte_case5_example", (5, 8, 2, 3)), ("rte_case118_example", None)])
+@pytest.mark.parametrize(
+    ("name", "sizes"),
+    [("rte_case5_example", (5, 8, 2, 3)), pytest.param("rte_case118_example", None, marks=pytest.mark.slow)],
+)
 def test_foreign_environments_compile(name, sizes):
     environment = copied_environment(name)
     compiled = compile_grid(environment)

@@ -19,6 +19,7 @@ import pytest
 from grid2op.Action import PlayableAction
 from grid2op.Environment.dispatch import DefaultRedispatchSolver, RedispatchConstraints, RedispatchState
 from grid2op.Exceptions import IllegalRedispatching, ImpossibleRedispatching
+from grids_of_tests import SHORTER
 from lightsim2grid import LightSimBackend
 from numpy.typing import NDArray
 
@@ -57,8 +58,8 @@ Problem, Programme = benchmark.Problem, benchmark.Programme
 
 @pytest.fixture(scope="module")
 def recorded() -> dict[str, list[Any]]:
-    """Problems of random play on all grids under Grid2Op's own dispatch."""
-    return {grid_id: benchmark.record(grid_id, RECORDED_STEPS, seed=1) for grid_id in GRID_IDS}
+    """Problems of random play under Grid2Op's own dispatch; a longer test below takes all grids."""
+    return {grid_id: benchmark.record(grid_id, RECORDED_STEPS, seed=1) for grid_id in SHORTER}
 
 
 def random_problem(random: np.random.Generator) -> Any:
@@ -270,7 +271,7 @@ def test_no_worse_than_grid2op_wherever_its_answer_is_feasible(recorded: dict[st
             continue
         compared += 1
         assert np.sqrt(programme.objective(change)) <= np.sqrt(programme.objective(theirs)) + 1e-5
-    assert compared > 0.9 * RECORDED_STEPS * len(GRID_IDS)
+    assert compared > 0.9 * RECORDED_STEPS * len(SHORTER)
 
 
 @pytest.mark.slow

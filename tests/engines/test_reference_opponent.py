@@ -374,7 +374,7 @@ def assert_same_episode(grid, n_steps, seed):
 @pytest.mark.parametrize("grid_id", ATTACKED_GRIDS)
 def test_same_attacks_in_an_episode(grid_id, changes):
     grid = grid_with(grid_id, changes)
-    turns = assert_same_episode(grid, 300, seed=2)
+    turns = assert_same_episode(grid, 200, seed=2)
     assert len(turns) > 100
     if changes == BUSY:
         assert len({turn.lines for turn in turns}) >= 3

@@ -23,11 +23,12 @@ from grid2op.Exceptions import (
 )
 from grid2op.Opponent import BaseOpponent, NeverAttackBudget
 from grid2op.Parameters import Parameters
+from grids_of_tests import SHORTER_OR_ALL
 from lightsim2grid import LightSimBackend
 from numpy.typing import NDArray
 
 from rl2grid.engines.reference.dispatch import ExactRedispatchSolver
-from rl2grid.grids import GRID_IDS, load_grid
+from rl2grid.grids import load_grid
 
 NO_OPPONENT = {
     "opponent_class": BaseOpponent,
@@ -157,7 +158,7 @@ def assert_same(left: Any, right: Any, names: list[str] | None = None, tolerance
 # The next step
 
 
-@pytest.mark.parametrize("grid_id", GRID_IDS)
+@pytest.mark.parametrize("grid_id", SHORTER_OR_ALL)
 def test_a_simulated_step_is_the_step_itself_when_the_forecast_is_right(make: MAKER, grid_id: str) -> None:
     environment, random, compared = make(grid_id), np.random.default_rng(0), 0
     observation = environment.get_obs()
@@ -185,7 +186,7 @@ def assert_same_dispatch_memory(left: Any, right: Any) -> None:
         np.testing.assert_allclose(np.asarray(value, float), np.asarray(remembered[name], float), rtol=1e-4, atol=1e-2)
 
 
-@pytest.mark.parametrize("grid_id", GRID_IDS)
+@pytest.mark.parametrize("grid_id", SHORTER_OR_ALL)
 def test_injections_are_the_forecast_for_the_row(make: MAKER, grid_id: str) -> None:
     environment = make(grid_id)
     observation, *_ = environment.step(environment.action_space())
@@ -212,14 +213,14 @@ def test_bundled_productions_are_forecast_nearer_to_the_present_row(make: MAKER,
     assert to_present < 0.8 * to_next
 
 
-def test_without_a_voltage_forecast_the_measured_voltages_are_kept(make: MAKER) -> None:
-    for grid_id in GRID_IDS:
-        environment = make(grid_id)
-        observation, *_ = environment.step(environment.action_space())
-        assert ("prod_v" in forecast(observation, 1)) == (grid_id == "bus14")
-        simulated, *_ = observation.simulate(environment.action_space())
-        kept = forecast(observation, 1)["prod_v"] if grid_id == "bus14" else observation.gen_v
-        np.testing.assert_allclose(simulated.gen_v, kept, rtol=1e-5)
+@pytest.mark.parametrize("grid_id", SHORTER_OR_ALL)
+def test_without_a_voltage_forecast_the_measured_voltages_are_kept(make: MAKER, grid_id: str) -> None:
+    environment = make(grid_id)
+    observation, *_ = environment.step(environment.action_space())
+    assert ("prod_v" in forecast(observation, 1)) == (grid_id == "bus14")
+    simulated, *_ = observation.simulate(environment.action_space())
+    kept = forecast(observation, 1)["prod_v"] if grid_id == "bus14" else observation.gen_v
+    np.testing.assert_allclose(simulated.gen_v, kept, rtol=1e-5)
 
 
 def test_simulating_leaves_the_environment_as_it_was(make: MAKER) -> None:
@@ -612,10 +613,10 @@ def test_horizons_without_a_forecast_are_refused(make: MAKER) -> None:
             observation.simulate(environment.action_space(), horizon)
 
 
-def test_no_grid_limits_the_number_of_simulations(make: MAKER) -> None:
-    for grid_id in GRID_IDS:
-        parameters = make(grid_id).parameters
-        assert parameters.MAX_SIMULATE_PER_STEP == parameters.MAX_SIMULATE_PER_EPISODE == -1
+@pytest.mark.parametrize("grid_id", SHORTER_OR_ALL)
+def test_no_grid_limits_the_number_of_simulations(make: MAKER, grid_id: str) -> None:
+    parameters = make(grid_id).parameters
+    assert parameters.MAX_SIMULATE_PER_STEP == parameters.MAX_SIMULATE_PER_EPISODE == -1
 
 
 def test_a_limit_of_simulations_raises_and_counts_refused_ones(make: MAKER) -> None:

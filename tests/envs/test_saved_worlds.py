@@ -208,7 +208,7 @@ def test_saved_states_are_texts_and_numbers_and_show_what_was_shown():
     assert other.state_dict() == vector.state_dict()
 
 
-@pytest.mark.parametrize("num_workers", [0, 2])
+@pytest.mark.parametrize("num_workers", [0, pytest.param(2, marks=pytest.mark.slow)])
 def test_vectors_of_the_reference_engine_come_back_by_playing_again(num_workers: int):
     vector = PowerGridVectorEnv("bus14-T0", 2, engine="reference", num_workers=num_workers)
     vector.reset(seed=3)

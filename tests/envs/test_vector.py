@@ -41,18 +41,55 @@ def test_made_by_gymnasium_with_autoreset_in_the_same_step():
     vector.close()
 
 
-def test_processes_and_batch_size_do_not_matter():
-    inside, workers, fewer = make_vector(3, 0), make_vector(3, 2), make_vector(2, 1)
+def test_batch_size_does_not_matter():
+    more, fewer = make_vector(3, 0), make_vector(2, 0)
+    observations = play(more, STEPS)[0]
+    fewer.reset(seed=5)
+    for step in range(STEPS):
+        observation = fewer.step(actions_of(step, 3)[:2])[0]
+        np.testing.assert_array_equal(observation, observations[step + 1, :2])
+    more.close()
+    fewer.close()
+
+
+def test_workers_play_refuse_and_come_back_as_one_process_does():
+    """One test, since every worker loads Grid2Op anew, which takes some seconds."""
+    inside, workers = make_vector(3, 0), make_vector(3, 2)
     a, b = play(inside, STEPS), play(workers, STEPS)
     for x, y in zip(a[:3], b[:3], strict=True):
         np.testing.assert_array_equal(x, y)
     assert a[2].any(), "no episode ended: the test did not see an autoreset"
-    fewer.reset(seed=5)
-    for step in range(STEPS):
-        observation = fewer.step(actions_of(step, 3)[:2])[0]
-        np.testing.assert_array_equal(observation, a[0][step + 1, :2])
-    for vector in (inside, workers, fewer):
-        vector.close()
+
+    with pytest.raises(UsageError, match="is not in the split train of bus14: choose one such as"):
+        workers.reset(options={"scenario": "no such month"})
+    np.testing.assert_array_equal(workers.reset(seed=1)[0], inside.reset(seed=1)[0])  # they still answer
+
+    for step in range(6):
+        inside.step(actions_of(step, 3))
+    assert_same_steps(inside, workers, inside.state_dict())
+    world = inside.save(0)
+    restored, _ = workers.restore(2, world)
+    np.testing.assert_array_equal(restored, inside.restore(2, world)[0])
+    assert workers.save(2) == world
+    with pytest.raises(UsageError, match='choose engine="native"'):
+        workers.imagine(0, 0)
+
+    workers.unwrapped._rows._workers[0]._process.kill()
+    with pytest.raises(RuntimeError, match="died"):
+        workers.step([0, 0, 0])
+    inside.close()
+    workers.close()
+
+
+def assert_same_steps(straight, resumed, saved):
+    """What follows a state that was saved and loaded is what follows it where it was saved."""
+    resumed.load_state_dict(saved)
+    for step in range(6, 14):
+        actions = actions_of(step, straight.num_envs)
+        a, b = straight.step(actions), resumed.step(actions)
+        for x, y in zip(a[:4], b[:4], strict=True):
+            np.testing.assert_array_equal(x, y)
+        np.testing.assert_array_equal(a[4]["grid_steps"], b[4]["grid_steps"])
 
 
 def test_equals_single_environments_and_shows_the_ending():
@@ -85,17 +122,11 @@ def test_equals_single_environments_and_shows_the_ending():
 
 
 def test_state_is_restored_by_playing_again():
-    straight, resumed = make_vector(2, 0), make_vector(2, 1)
+    straight, resumed = make_vector(2, 0), make_vector(2, 0)
     straight.reset(seed=1)
     for step in range(6):
         straight.step(actions_of(step, 2))
-    saved = straight.state_dict()
-    resumed.load_state_dict(saved)
-    for step in range(6, 14):
-        a, b = straight.step(actions_of(step, 2)), resumed.step(actions_of(step, 2))
-        for x, y in zip(a[:4], b[:4], strict=True):
-            np.testing.assert_array_equal(x, y)
-        np.testing.assert_array_equal(a[4]["grid_steps"], b[4]["grid_steps"])
+    assert_same_steps(straight, resumed, straight.state_dict())
     straight.close()
     resumed.close()
 
@@ -120,23 +151,6 @@ def test_refused_action_steps_no_environment():
         vector.step([0, 50])
     assert vector.state_dict() == before
     with pytest.raises(UsageError, match="give one each"):
-        vector.step([0])
-    vector.close()
-
-
-def test_refusals_of_a_worker_arrive_as_one_sentence():
-    vector = make_vector(2, 2)
-    with pytest.raises(UsageError, match="is not in the split train of bus14: choose one such as"):
-        vector.reset(options={"scenario": "no such month"})
-    assert vector.reset(seed=0)[0].shape[0] == 2, "the workers must still answer"
-    vector.close()
-
-
-def test_dead_worker_is_reported():
-    vector = make_vector(1, 1)
-    vector.reset(seed=0)
-    vector.unwrapped._rows._workers[0]._process.kill()
-    with pytest.raises(RuntimeError, match="died"):
         vector.step([0])
     vector.close()
 

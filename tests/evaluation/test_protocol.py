@@ -381,12 +381,13 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_checkpoint_plays_as_it_was_trained(checkpoint, tmp_path):
-    alone = evaluate(checkpoint, "bus14-T0", name="mine")
+    months = {"scenarios": list_scenarios("bus14", "validation")[:3], "name": "mine"}
+    alone = evaluate(checkpoint, "bus14-T0", **months)
     assert alone.identity["heuristic"] == "idle"
     assert alone.identity["agent_identity"]["policy_hash"]
     assert {episode.agent for episode in alone.episodes} == {"mine"}
     assert all(episode.agent_hash and episode.heuristic == "idle" for episode in alone.episodes)
-    remote = evaluate(checkpoint, "bus14-T0", name="mine", workers=2, output=tmp_path / "out")
+    remote = evaluate(checkpoint, "bus14-T0", **months, workers=1, output=tmp_path / "out")
     assert without_times(remote.episodes) == without_times(alone.episodes)
     assert remote.identity == alone.identity
 

@@ -410,7 +410,7 @@ def assert_same_statistics(grid, n_episodes, n_steps):
 
 @pytest.mark.parametrize("grid_id", ATTACKED_GRIDS)
 def test_statistics_equal_grid2op(grid_id):
-    assert_same_statistics(load_grid(grid_id), n_episodes=20, n_steps=4032)
+    assert_same_statistics(load_grid(grid_id), n_episodes=10, n_steps=4032)
 
 
 @pytest.mark.slow
