@@ -4,6 +4,7 @@
 grids, with probes that look for trouble and with policies trained for the purpose, and writes
 ``benchmarks/results/parity.json``. What was played is kept: an interrupted run goes on where it stopped, and
 a longer one begins with what is there. It fails if the engines disagree without a cause (``docs/parity.md``).
+``--kinds joint`` compares actions of one kind alone; only topology and continuous ones need trained policies.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import json
 import math
 import multiprocessing
 import os
+import shlex
 import signal
 import sys
 import time
@@ -35,7 +37,7 @@ import rl2grid
 from rl2grid.algorithms.policy_agent import CHECKPOINT_FILE, load_agent
 from rl2grid.engines.differential import CAUSES, TOLERANCES, SideBySide
 from rl2grid.engines.native.engine import NativeEngine
-from rl2grid.engines.probes import PROBES, Probe, make_probe
+from rl2grid.engines.probes import KINDS, PROBES, Probe, make_probe
 from rl2grid.engines.reference.engine import ReferenceEngine
 from rl2grid.envs.description import single_spaces
 from rl2grid.envs.tasks import find_task
@@ -55,7 +57,6 @@ PART_STEPS = 10_000
 NATIVE_ROWS = 3
 TRAINED = "trained"
 TRAINING_DECISIONS = 4096
-PROCESSES = 2
 _EPISODES_OF_A_PART = 1_000_000
 _TASKS = {"topology": "T0", "continuous": "R"}
 
@@ -118,16 +119,16 @@ class TrainedProbe:
         return self._catalogue[self._agent.act(self._observation, {})]
 
 
-def cells_of(grids: Iterable[str]) -> list[Cell]:
+def cells_of(grids: Iterable[str], kinds: Iterable[str]) -> list[Cell]:
     """Everything to be compared; topology actions alone do not meet the dispatch."""
     both = ("exact", "grid2op")
     dispatches = {"topology": ("exact",), "continuous": both, "mixed": both, "joint": both}
     return [
         Cell(grid, kind, dispatch, policy)
         for grid in grids
-        for kind, probes in PROBES.items()
+        for kind in kinds
         for dispatch in dispatches[kind]
-        for policy in (*probes, *((TRAINED,) if kind in _TASKS else ()))
+        for policy in (*PROBES[kind], *((TRAINED,) if kind in _TASKS else ()))
     ]
 
 
@@ -190,14 +191,15 @@ def compare(part: Part, seed: int, policies: Path) -> dict[str, Any]:
     }
 
 
-def runs_of(grids: Iterable[str]) -> list[str]:
-    """Names of the trainings: one topology and one continuous task per grid."""
-    return [f"{grid}-{task}" for grid in grids for task in _TASKS.values()]
+def runs_of(cells: Iterable[Cell]) -> list[str]:
+    """Names of the trainings: one per grid and kind of action of which a trained policy is compared."""
+    trained = (cell for cell in cells if cell.policy == TRAINED)
+    return list(dict.fromkeys(f"{cell.grid}-{_TASKS[cell.kind]}" for cell in trained))
 
 
-def train_policies(grids: Iterable[str], folder: Path) -> None:
+def train_policies(cells: Iterable[Cell], folder: Path) -> None:
     """Train the policies that are not there yet, briefly."""
-    for name in runs_of(grids):
+    for name in runs_of(cells):
         run = folder / name
         if run.exists() and runs.is_finished(run):
             continue
@@ -241,7 +243,7 @@ class Store:
         return any(all(record[key] == value for key, value in wanted.items()) for record in self.records)
 
 
-def play_parts(parts: list[Part], store: Store, seed: int, policies: Path, deadline: float) -> None:
+def play_parts(parts: list[Part], store: Store, seed: int, policies: Path, deadline: float, processes: int) -> None:
     """Play what is missing, until the deadline or an interruption; parts under way are finished."""
     missing = [part for part in parts if not store.has(part)]
     total = sum(part.steps for part in parts)
@@ -249,7 +251,7 @@ def play_parts(parts: list[Part], store: Store, seed: int, policies: Path, deadl
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[rate]}"))
     with (
         Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(elapsed_when_finished=True)) as progress,
-        ProcessPoolExecutor(PROCESSES, mp_context=context, initializer=_leave_interrupts_to_the_parent) as pool,
+        ProcessPoolExecutor(processes, mp_context=context, initializer=_leave_interrupts_to_the_parent) as pool,
     ):
         done = total - sum(part.steps for part in missing)
         bar = progress.add_task("steps compared", total=total, completed=done, rate="")
@@ -257,7 +259,7 @@ def play_parts(parts: list[Part], store: Store, seed: int, policies: Path, deadl
         began, played = time.monotonic(), 0
         try:
             while running or (missing and time.monotonic() < deadline):
-                while missing and len(running) < PROCESSES and time.monotonic() < deadline:
+                while missing and len(running) < processes and time.monotonic() < deadline:
                     running.add(pool.submit(compare, missing.pop(0), seed, policies))
                 ended, running = wait(running, return_when=FIRST_COMPLETED)
                 for future in ended:
@@ -279,19 +281,21 @@ def _leave_interrupts_to_the_parent() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def summary(records: list[dict[str, Any]], cells: list[Cell], seed: int, source: str, policies: Path) -> dict[str, Any]:
+def summary(
+    records: list[dict[str, Any]], cells: list[Cell], seed: int, source: str, policies: Path, command: str
+) -> dict[str, Any]:
     """What the committed result says."""
     grids = tuple(dict.fromkeys(cell.grid for cell in cells))
     records = [record for record in records if Cell(**record["cell"]) in cells]
     causes = Counter(each["cause"] for record in records for each in record["disagreements"])
     return {
-        "command": "python benchmarks/parity.py",
+        "command": command,
         "seed": seed,
         "versions": library_versions(),
         "hashes": {
             "source": source,
             "scenarios": {grid: scenario_pack_hash(grid, "bundled") for grid in grids},
-            "policies": {run: _policy_hash(policies / run) for run in runs_of(grids)},
+            "policies": {run: _policy_hash(policies / run) for run in runs_of(cells)},
         },
         "steps": sum(record["compared"] for record in records),
         "simulations": sum(record["simulations"] for record in records),
@@ -351,6 +355,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--steps", type=int, default=1_000_000, help="grid steps to compare, over all grids")
     parser.add_argument("--grids", nargs="+", default=list(GRID_IDS), choices=GRID_IDS)
+    parser.add_argument("--kinds", nargs="+", default=list(KINDS), choices=KINDS, help="kinds of actions to compare")
+    parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--minutes", type=float, default=math.inf, help="begin no part after this time")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path, default=Path(__file__).parent / "results" / "parity.json")
@@ -359,13 +365,14 @@ def main() -> int:
         signal.signal(request, signal.default_int_handler)
     deadline = time.monotonic() + 60 * arguments.minutes
     folder = data_folder() / "parity"
-    train_policies(arguments.grids, folder / "policies")
-    cells = cells_of(arguments.grids)
+    cells = cells_of(arguments.grids, arguments.kinds)
+    train_policies(cells, folder / "policies")
     parts = list(parts_of(cells, arguments.steps))
     source = source_hash()  # now: the code may be edited while it is compared
     store = Store(folder / f"{source}-{arguments.seed}.jsonl")
-    play_parts(parts, store, arguments.seed, folder / "policies", deadline)
-    result = summary(store.records, cells, arguments.seed, source, folder / "policies")
+    play_parts(parts, store, arguments.seed, folder / "policies", deadline, arguments.processes)
+    command = shlex.join(["python", "benchmarks/parity.py", *sys.argv[1:]])
+    result = summary(store.records, cells, arguments.seed, source, folder / "policies", command)
     write(result, arguments.output)
     explained = ", ".join(f"{count} {cause}" for cause, count in result["explained"].items() if count) or "none"
     print(

@@ -73,7 +73,7 @@ def test_engines_agree(grid_id, kind, name):
     assert tally.simulations >= 2
 
 
-@pytest.mark.parametrize("kind", ["continuous", "mixed"])
+@pytest.mark.parametrize("kind", ["continuous", "mixed", "joint"])
 @pytest.mark.parametrize("grid_id", GRID_IDS)
 def test_engines_agree_with_the_dispatch_of_grid2op(grid_id, kind):
     tally = compare(grid_id, kind, "adversarial", steps=50, seed=2, dispatch="grid2op")
