@@ -21,7 +21,7 @@ from rl2grid.engines.reference.engine import ReferenceEngine
 from rl2grid.engines.transition import Transitions
 from rl2grid.errors import UsageError
 from rl2grid.grids import GRID_IDS, load_grid
-from rl2grid.mdp.actions import full_catalogue, switch
+from rl2grid.mdp.actions import StepAction, full_catalogue, switch
 from rl2grid.mdp.rewards import PRESETS
 from rl2grid.mdp.state import new_state
 from rl2grid.mdp.termination import GameOver
@@ -210,6 +210,36 @@ def test_a_difference_within_the_tolerance_is_admitted_and_remembered():
     tally = play_beside(Tampered(17, change("rho", 5e-6)))
     assert tally.disagreements == []
     assert tally.largest["rho"] == pytest.approx(5e-6, rel=0.02)
+
+
+class Forgetful(Tampered):
+    """A reference engine that plays only a part of every action."""
+
+    def __init__(self, part):
+        super().__init__(0, lambda state, i: None)
+        self._part = part
+
+    def step(self, i, action):
+        super().step(i, self._part(action))
+
+
+@pytest.mark.parametrize(
+    "part",
+    [
+        lambda action: StepAction(action.changes[1:], action.values),
+        lambda action: StepAction(action.changes[:1], action.values),
+        lambda action: StepAction(action.changes, action.values if len(action.changes) < 2 else None),
+    ],
+    ids=["without the first change", "the first change alone", "without the injection beside changes"],
+)
+def test_a_part_of_a_joint_action_that_is_not_played_is_found(part):
+    reference, _ = engines("bus14", "exact")
+    pair, probe = SideBySide(reference, Forgetful(part)), make_probe(load_grid("bus14"), "joint", "within limits")
+    for number in range(20):
+        pair.play(plan("bus14", 6, number), probe, 50)
+        if pair.tally.disagreements:
+            break
+    assert pair.tally.unexplained
 
 
 def test_nan_is_a_fault():
