@@ -13,7 +13,17 @@ from rl2grid.engines.reference.engine import ReferenceEngine
 from rl2grid.engines.transition import Transitions
 from rl2grid.errors import UsageError
 from rl2grid.grids import load_grid
-from rl2grid.mdp.actions import DO_NOTHING, full_catalogue, inject, joint, move, reconnect, restore, switch
+from rl2grid.mdp.actions import (
+    DO_NOTHING,
+    continuous_layout,
+    full_catalogue,
+    inject,
+    joint,
+    move,
+    reconnect,
+    restore,
+    switch,
+)
 from rl2grid.mdp.rewards import PRESETS
 from rl2grid.scenarios.episodes import EpisodePlan
 from rl2grid.scenarios.library import list_scenarios
@@ -214,6 +224,46 @@ def test_engines_agree_where_the_rules_allow_more(lines, subs):
         number += 1
     assert not pair.tally.unexplained, "\n".join(map(str, pair.tally.unexplained))
     assert pair.tally.steps == 150
+    reference.close()
+
+
+class BeyondReach:
+    """Asks one generator for more until its range is exhausted, and opens or closes a line beside it from then on."""
+
+    def __init__(self, grid):
+        self._size, generators = continuous_layout(grid).size, continuous_layout(grid).redispatch
+        self._entry = int(np.argmin(grid.gen_pmax[generators] / grid.gen_max_ramp_up[generators]))
+        self._gen = generators[self._entry]
+        self._last = grid.gen_pmax[self._gen] - grid.gen_max_ramp_up[self._gen]
+
+    def begin(self, random):
+        self._random = random
+
+    def choose(self, state, i):
+        values = np.zeros(self._size, np.float32)
+        values[self._entry] = 1.0
+        if state.target_dispatch[i, self._gen] <= self._last:
+            return inject(values)
+        free = state.time_before_cooldown_line[i] == 0
+        opened = np.flatnonzero(free & ~state.line_status[i])
+        change = reconnect(int(opened[0])) if len(opened) else switch(int(self._random.choice(np.flatnonzero(free))))
+        return joint(inject(values), change)
+
+
+@pytest.mark.parametrize("dispatch", ["exact", "grid2op"])
+@pytest.mark.parametrize("grid_id", ["bus36-MO-v0", "bus118-MOB-v1"])
+def test_engines_agree_on_the_changes_beside_a_redispatch_out_of_reach(grid_id, dispatch):
+    """Grid2Op keeps such changes, without a cooldown; with the exact dispatch nothing of the action is kept."""
+    grid = load_grid(grid_id)
+    reference = ReferenceEngine(grid, 1, dispatch)
+    pair, number = SideBySide(reference, NativeEngine(grid, 2, dispatch), dispatch=dispatch, simulate_every=5), 0
+    while pair.tally.steps < 80:
+        series = list_scenarios(grid_id, "bundled")[0]
+        pair.play(EpisodePlan(0, number, series, 0, 200), BeyondReach(grid), 80 - pair.tally.steps)
+        number += 1
+    assert not pair.tally.disagreements, "\n".join(map(str, pair.tally.disagreements))
+    assert pair.tally.counts["illegal"] >= 10
+    assert pair.tally.simulations >= 10
     reference.close()
 
 
