@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from rl2grid.arrays import I64
 from rl2grid.engines.worlds import World, world_of_plain
 from rl2grid.envs.description import check_action
-from rl2grid.envs.environments import Environments, StreamPosition
 from rl2grid.envs.info import batch_info
 from rl2grid.envs.options import TaskOptions
 from rl2grid.envs.rows import Batch
+from rl2grid.envs.task_environments import StreamPosition, TaskEnvironments
 from rl2grid.envs.tasks import Task
 from rl2grid.errors import UsageError
 from rl2grid.mdp.features import observation_size
@@ -24,8 +24,8 @@ Decisions = TypeVar("Decisions")
 """Checked actions of all rows, in the form in which the engine takes them."""
 
 
-class EngineRows(Environments, ABC, Generic[Decisions]):
-    """:class:`~rl2grid.envs.environments.Environments` that are played together: :class:`~rl2grid.envs.rows.Rows`.
+class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
+    """Task environments that are played together: :class:`~rl2grid.envs.rows.Rows`.
 
     How rows are begun, stepped and observed is left to those who derive from it.
     """
@@ -97,7 +97,7 @@ class EngineRows(Environments, ABC, Generic[Decisions]):
         return observation, self.info(i)
 
     def restore(self, i: int, world: World) -> None:
-        """Bring row ``i`` to where ``world`` was saved; see :meth:`Environments.restore`."""
+        """Bring row ``i`` to where ``world`` was saved; see :meth:`TaskEnvironments.restore`."""
         super().restore(i, world)
         # A copy: the array was handed out with the infos of the last step.
         self._shown_effects = self._shown_effects.copy()

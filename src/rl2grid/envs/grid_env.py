@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from rl2grid.engines.transition import Listener
 from rl2grid.engines.worlds import World
 from rl2grid.envs.description import TaskDescription, single_spaces
-from rl2grid.envs.environments import Environments, SimulationResult
 from rl2grid.envs.options import keyword_names, options_of, shows_options
+from rl2grid.envs.task_environments import SimulationResult, TaskEnvironments
 from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError, one_of
 from rl2grid.mdp.state import GridState
@@ -100,7 +100,7 @@ class PowerGridEnv(gymnasium.Env[NDArray[np.float32], Any], TaskDescription):
         self._last_action: Any = None
         self.task = find_task(task)
         self.options = options_of(self.task, keywords, keyword_names(type(self)))
-        self._environments = Environments(self.task, self.options, 1)
+        self._environments = TaskEnvironments(self.task, self.options, 1)
         observations, self.action_space = single_spaces(self.task)
         self.observation_space = cast("gymnasium.Space[NDArray[np.float32]]", observations)
 

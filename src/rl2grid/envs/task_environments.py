@@ -86,10 +86,11 @@ def make_transitions(task: Task, options: TaskOptions, n: int) -> Transitions:
     return NativeTransitions(native, options.heuristic, topology_task, reward, gamma)
 
 
-class Environments:
-    """``n`` environments of one task, addressed by row.
+class TaskEnvironments:
+    """``n`` environments of one task, addressed by row: an engine's transitions as agents see them.
 
-    The single environment plays row 0 of one; :mod:`rl2grid.envs.rows` plays all rows together.
+    What an engine computes with is :class:`rl2grid.engines.native.environments.Environments`, which knows no task. The
+    single environment plays row 0 of one; :mod:`rl2grid.envs.rows` plays all rows together.
     """
 
     def __init__(self, task: Task, options: TaskOptions, n: int) -> None:
@@ -400,8 +401,8 @@ class Environments:
 
 
 def _rebuild(
-    kind: type[Environments], arguments: tuple[Any, ...], worlds: list[World | None], listeners: list[Listener]
-) -> Environments:
+    kind: type[TaskEnvironments], arguments: tuple[Any, ...], worlds: list[World | None], listeners: list[Listener]
+) -> TaskEnvironments:
     """The environments that were copied or pickled."""
     environments = kind(*arguments)
     environments.transitions.listeners.extend(listeners)
