@@ -14,7 +14,8 @@ from typing import Any
 
 from rl2grid.algorithms.registry import find_algorithm
 from rl2grid.records.files import write_json
-from rl2grid.training.runs import RunArgs, hyperparameters, make_envs
+from rl2grid.training.request import RunArgs, hyperparameters
+from rl2grid.training.runs import make_envs
 
 RESULTS = Path(__file__).resolve().parent / "results" / "loop_speed.json"
 LOOPS: tuple[tuple[str, str, str | None], ...] = (

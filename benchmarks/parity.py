@@ -50,7 +50,7 @@ from rl2grid.records.versions import library_versions
 from rl2grid.scenarios.cache import data_folder
 from rl2grid.scenarios.episodes import EpisodePlan
 from rl2grid.scenarios.library import list_scenarios, load_scenario, scenario_pack_hash
-from rl2grid.training import runs
+from rl2grid.training import request, runs
 
 PART_STEPS = 10_000
 """Steps of a part, the least that an interruption loses."""
@@ -207,8 +207,8 @@ def train_policies(cells: Iterable[Cell], folder: Path) -> None:
         if run.exists():
             runs.resume(run)
             continue
-        chosen = runs.hyperparameters("ppo", name, total_timesteps=TRAINING_DECISIONS, num_envs=4)
-        runs.train(runs.RunArgs(name, chosen, folder=run, tensorboard=False))
+        chosen = request.hyperparameters("ppo", name, total_timesteps=TRAINING_DECISIONS, num_envs=4)
+        runs.train(request.RunArgs(name, chosen, folder=run, tensorboard=False))
 
 
 def source_hash() -> str:
@@ -361,8 +361,8 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path, default=Path(__file__).parent / "results" / "parity.json")
     arguments = parser.parse_args()
-    for request in (signal.SIGINT, signal.SIGTERM):  # shells make processes in the background ignore the first
-        signal.signal(request, signal.default_int_handler)
+    for number in (signal.SIGINT, signal.SIGTERM):  # shells make processes in the background ignore the first
+        signal.signal(number, signal.default_int_handler)
     deadline = time.monotonic() + 60 * arguments.minutes
     folder = data_folder() / "parity"
     cells = cells_of(arguments.grids, arguments.kinds)

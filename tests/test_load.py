@@ -15,7 +15,8 @@ import torch
 import rl2grid
 from rl2grid.algorithms.checkpoint import load_checkpoint
 from rl2grid.errors import UsageError
-from rl2grid.training.runs import RunArgs, hyperparameters, train
+from rl2grid.training.request import RunArgs, hyperparameters
+from rl2grid.training.runs import train
 
 
 def run_folder(folder: Path) -> Path:

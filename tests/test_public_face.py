@@ -14,7 +14,7 @@ import rl2grid
 from rl2grid.errors import UsageError
 from rl2grid.evaluation import protocol
 from rl2grid.records.episodes import EPISODES_FILE, read_episodes
-from rl2grid.training.runs import RunArgs
+from rl2grid.training.request import RunArgs
 
 MONTH = "generated/700000-00"
 

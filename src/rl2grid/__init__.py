@@ -85,13 +85,13 @@ def train(
         ImportError: PyTorch is not installed.
     """
     from rl2grid.envs.tasks import find_task
-    from rl2grid.training import runs
+    from rl2grid.training import request, runs
     from rl2grid.training.validation import find_validator
 
     chosen = find_task(task)
-    args = runs.RunArgs(
+    args = request.RunArgs(
         task=chosen,
-        hyperparameters=runs.hyperparameters(algorithm, chosen, preset, **(hyperparameters or {})),
+        hyperparameters=request.hyperparameters(algorithm, chosen, preset, **(hyperparameters or {})),
         algorithm=algorithm,
         folder=None if folder is None else Path(folder),
         env_keywords=options,

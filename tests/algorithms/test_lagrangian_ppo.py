@@ -37,7 +37,8 @@ from rl2grid.algorithms.on_policy import advantages_of_rewards
 from rl2grid.algorithms.policy_agent import PolicyAgent
 from rl2grid.envs.registration import register_all
 from rl2grid.errors import UsageError
-from rl2grid.training.runs import RunArgs, hyperparameters, is_finished, read_config, resume, train
+from rl2grid.training.request import RunArgs, hyperparameters, read_config
+from rl2grid.training.runs import is_finished, resume, train
 
 SMALL = Args(
     seed=3,

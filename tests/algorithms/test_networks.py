@@ -38,7 +38,8 @@ from rl2grid.envs.tasks import find_task
 from rl2grid.errors import UsageError
 from rl2grid.mdp.actions import ActionCatalogue
 from rl2grid.records.evaluations import identity_hash
-from rl2grid.training.runs import RunArgs, hyperparameters, make_envs, train
+from rl2grid.training.request import RunArgs, hyperparameters
+from rl2grid.training.runs import make_envs, train
 
 LEDGER = Path(__file__).resolve().parents[2] / "benchmarks" / "results" / "baselines.json"
 

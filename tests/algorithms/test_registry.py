@@ -18,7 +18,7 @@ from rl2grid.algorithms.registry import (
 )
 from rl2grid.errors import UsageError
 from rl2grid.studies.tuning import search_space
-from rl2grid.training.runs import hyperparameters
+from rl2grid.training.request import hyperparameters
 
 OURS = ("ppo", "lagrangian-ppo", "dqn", "sac", "td3")
 

@@ -14,7 +14,7 @@ from rl2grid.ledger.verification import verify_entry
 from rl2grid.records.evaluations import load_evaluation
 from rl2grid.records.trainings import RUN_FILE, read_training_run
 from rl2grid.training.commands import training_command
-from rl2grid.training.runs import read_config
+from rl2grid.training.request import read_config
 
 TRAINING = [
     *("train", "ppo", "bus14-T0", "--heuristic", "idle", "--total-timesteps", "256", "--num-envs", "4", "--num-steps"),

@@ -13,7 +13,7 @@ from documentation import PAGES, blocks, name_of
 from rl2grid.cli import main as command_line
 from rl2grid.envs.tasks import find_task
 from rl2grid.evaluation.agents import AGENTS
-from rl2grid.training import runs, validation
+from rl2grid.training import request, runs, validation
 
 QUICK = (["tasks"], ["actions"], ["study", "list"], ["data", "list"])
 """Subcommands that are run as shown."""
@@ -43,9 +43,9 @@ def arguments_of(line):
 
 
 def train_shortly(folder):
-    hyperparameters = runs.hyperparameters("ppo", "bus14-T0", num_envs=2, num_steps=32, total_timesteps=64)
+    hyperparameters = request.hyperparameters("ppo", "bus14-T0", num_envs=2, num_steps=32, total_timesteps=64)
     keywords = {"heuristic": "idle"}
-    runs.train(runs.RunArgs("bus14-T0", hyperparameters, folder=folder, env_keywords=keywords, tensorboard=False))
+    runs.train(request.RunArgs("bus14-T0", hyperparameters, folder=folder, env_keywords=keywords, tensorboard=False))
 
 
 def identify(value):
@@ -59,7 +59,7 @@ def test_commands_exist_with_their_flags(block, line, monkeypatch):
     if arguments[0] == "train":
         monkeypatch.setattr(runs, "train", begin)
         monkeypatch.setattr(runs, "resume", begin)
-        monkeypatch.setattr(runs, "read_config", lambda folder: (None, {}))
+        monkeypatch.setattr(request, "read_config", lambda folder: (None, {}))
         monkeypatch.setattr(validation, "find_validator", lambda args: None)
         with pytest.raises(TrainingBeginsError):
             command_line.main(arguments)

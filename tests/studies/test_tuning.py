@@ -29,7 +29,7 @@ from rl2grid.studies.search import (
     work,
 )
 from rl2grid.studies.tuning import Tuning, parse_tuning
-from rl2grid.training import runs
+from rl2grid.training import request, runs
 
 SOURCES = str(Path(rl2grid.__file__).parents[1])
 SEARCH: dict[str, Any] = {"name": "search", "algorithm": "ppo", "task": "bus14-T0", "budget": 512, "trials": 2}
@@ -154,7 +154,7 @@ def test_of_equal_trials_one_is_trained_and_the_others_take_its_result(
     optuna = pytest.importorskip("optuna")
     trained: list[Path] = []
 
-    def train(args: runs.RunArgs, *, evaluate: Any) -> None:
+    def train(args: request.RunArgs, *, evaluate: Any) -> None:
         assert args.folder is not None
         args.folder.mkdir(parents=True)
         trained.append(args.folder)

@@ -16,7 +16,7 @@ from rl2grid.cli.main import main
 from rl2grid.envs.tasks import find_task
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.flags import evaluate_command, flags
-from rl2grid.training import runs
+from rl2grid.training import request, runs
 from rl2grid.training.commands import train_command, training_command
 
 CASES: list[tuple[str, str, str, dict[str, Any], dict[str, Any]]] = [
@@ -39,11 +39,11 @@ def test_a_command_asks_for_the_run_that_it_was_made_from(
     keywords: dict[str, Any],
     monkeypatch: pytest.MonkeyPatch,
 ):
-    chosen = runs.hyperparameters(algorithm, task, preset, **changes)
-    args = runs.RunArgs(
+    chosen = request.hyperparameters(algorithm, task, preset, **changes)
+    args = request.RunArgs(
         find_task(task).id, chosen, algorithm=algorithm, env_keywords=keywords, evaluate_every=700, validation_months=3
     )
-    asked: list[runs.RunArgs] = []
+    asked: list[request.RunArgs] = []
     monkeypatch.setattr(runs, "train", lambda args, **_: asked.append(args))
     monkeypatch.setattr(command, "_report", lambda *_: 0)
     words = shlex.split(train_command(args, preset))
@@ -56,8 +56,8 @@ def test_a_command_asks_for_the_run_that_it_was_made_from(
 
 
 def test_what_has_no_influence_on_results_is_left_out():
-    args = runs.RunArgs(
-        "rl2grid/bus14-T0-v0", runs.hyperparameters("ppo", "bus14-T0"), num_threads=2, checkpoint_seconds=1.0
+    args = request.RunArgs(
+        "rl2grid/bus14-T0-v0", request.hyperparameters("ppo", "bus14-T0"), num_threads=2, checkpoint_seconds=1.0
     )
     assert train_command(args) == "rl2grid train ppo bus14-T0"
 
@@ -65,7 +65,7 @@ def test_what_has_no_influence_on_results_is_left_out():
 def test_a_run_without_validation_is_resumed_and_made_again_without(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     heard: list[Any] = []
 
-    def train(args: runs.RunArgs, **chosen: Any) -> Path:
+    def train(args: request.RunArgs, **chosen: Any) -> Path:
         heard.append(chosen["evaluate"])
         return original(args, make_envs=toy_envs, **chosen)
 

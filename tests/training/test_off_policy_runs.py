@@ -15,7 +15,8 @@ from test_runs import assert_same_run, environment, falling, request, table, toy
 from rl2grid.algorithms.checkpoint import load_checkpoint
 from rl2grid.algorithms.policy_agent import load_agent
 from rl2grid.errors import UsageError
-from rl2grid.training.runs import RunArgs, hyperparameters, read_config, resume, train
+from rl2grid.training.request import RunArgs, hyperparameters, read_config
+from rl2grid.training.runs import resume, train
 
 SIZES: dict[str, Any] = {
     "seed": 5,

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +24,9 @@ import rl2grid
 from rl2grid.algorithms.checkpoint import load_checkpoint, save_checkpoint
 from rl2grid.algorithms.policy_agent import PolicyAgent, load_agent
 from rl2grid.algorithms.ppo import Args
-from rl2grid.envs.tasks import find_task
 from rl2grid.errors import UsageError
-from rl2grid.training.runs import RunArgs, find_limits, hyperparameters, is_finished, read_config, resume, train
+from rl2grid.training.request import RunArgs, hyperparameters
+from rl2grid.training.runs import is_finished, resume, train
 
 SMALL = Args(
     seed=5,
@@ -38,7 +38,6 @@ SMALL = Args(
     actor_layers=(8,),
     critic_layers=(8,),
 )
-MISSPELT = hyperparameters("lagrangian-ppo", "bus14-T0", constraints=("LIS",), thresholds=(1.0,))
 TIMES = ["charts/SPS", "charts/grid_SPS", "charts/environment_share"]
 
 
@@ -141,17 +140,6 @@ def test_a_run_folder_holds_everything_about_the_run(tmp_path: Path):
     assert "finished at 384 decisions" in (folder / "log.txt").read_text()
 
 
-def test_the_stored_request_is_the_request(tmp_path: Path):
-    folder = train(request(tmp_path / "run"), make_envs=toy_envs)
-    args, _ = read_config(folder)
-    assert args.hyperparameters == SMALL
-    assert args.env_keywords["reward"] == (1.0, 0.5, 0.25)
-    assert args.env_keywords["split"] == "train"
-    assert args.task == find_task("rl2grid/bus14-T0-v0")
-    assert args.folder == folder
-    assert asdict(args)["checkpoint_seconds"] == 0.0
-
-
 def test_the_best_policy_by_validation_survival_is_kept(tmp_path: Path):
     folder = train(request(tmp_path / "run"), evaluate=falling, make_envs=toy_envs)
     assert load_agent(folder, "bus14-T0").identity["decisions"] == 96
@@ -182,18 +170,6 @@ def test_the_best_policy_under_a_constraint_is_the_one_most_often_safe(tmp_path:
     assert "75.00% safe and completed, survival 0.9500, after 288" in (tmp_path / "id" / "log.txt").read_text()
 
 
-def test_limits_are_those_of_the_constraint_or_of_lagrangian_ppo(tmp_path: Path):
-    def limits(algorithm: str, task: str, keyword: str | None = None, **changes: Any) -> dict[str, float]:
-        args = hyperparameters(algorithm, task, **changes)
-        return find_limits(RunArgs(task, args, algorithm, env_keywords={"constraint": keyword}))
-
-    assert limits("ppo", "bus14-R") == {}
-    assert limits("ppo", "bus14-R", "TLO") == {"TLO": 50.0}
-    assert limits("dqn", "bus14-T0-LSI") == {"LSI": 0.0}
-    assert limits("lagrangian-ppo", "bus14-R", "TLO", thresholds=(20.0,)) == {"TLO": 20.0}
-    assert limits("lagrangian-ppo", "bus14-T0", constraints=("LSI", "TLO")) == {"LSI": 0.0, "TLO": 50.0}
-
-
 def test_validation_does_not_disturb_training(tmp_path: Path):
     def drawing(agent: PolicyAgent) -> Mapping[str, float]:
         torch.randn(10)
@@ -222,45 +198,7 @@ def _sizes(args: Args) -> dict[str, Any]:
     return {name: getattr(args, name) for name in ("total_timesteps", "num_envs", "num_steps", "gamma")}
 
 
-# --- Requests that cannot be met ------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("changes", "sentence"),
-    [
-        ({"task": "bus15-T0"}, "does not exist"),
-        ({"algorithm": "td4"}, "choose one of ppo"),
-        ({"env_keywords": {"heuristics": "idle"}}, "Environment keyword 'heuristics' does not exist"),
-        ({"env_keywords": {"heuristic": "lazy"}}, "lazy"),
-        ({"env_keywords": {"gamma": 0.9}}, "gamma belongs to"),
-        ({"env_keywords": {"split": "test"}}, "Training on the test scenarios"),
-        ({"env_keywords": {"reward": lambda state, i: 0.0}}, "stores its reward by name"),
-        ({"env_keywords": {"scenario": "nowhere"}}, "Scenario 'nowhere' is not in the split train"),
-        ({"evaluate_every": 0}, "evaluate_every"),
-        ({"task": "bus14-R"}, "Only discrete actions can be masked"),
-        ({"task": "bus14-T0-LSI", "env_keywords": {"constraint": "TLO"}}, "contradicts task 'rl2grid/bus14-T0-LSI-v0'"),
-        ({"algorithm": "lagrangian-ppo", "hyperparameters": hyperparameters("lagrangian-ppo", "bus14-T0")}, "needs a"),
-        ({"algorithm": "lagrangian-ppo", "hyperparameters": MISSPELT}, "'LIS' does not exist: choose one of LSI, TLO"),
-    ],
-)
-def test_requests_that_cannot_be_met_leave_nothing_behind(tmp_path: Path, changes: dict[str, Any], sentence: str):
-    with pytest.raises(UsageError, match=sentence):
-        train(request(tmp_path / "run", **changes), make_envs=toy_envs)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_an_algorithm_that_cannot_learn_the_task_is_refused():
-    with pytest.raises(UsageError, match=r"'td3' cannot learn .*, which has discrete actions: choose one of ppo"):
-        hyperparameters("td3", "bus14-T0")
-
-
-def test_unknown_presets_and_hyperparameters_are_refused():
-    with pytest.raises(UsageError, match="choose one of default, paper"):
-        hyperparameters("ppo", "bus14-T0", "papers")
-    with pytest.raises(UsageError, match="'learning_rate' does not exist: choose one of seed, "):
-        hyperparameters("ppo", "bus14-T0", learning_rate=1.0)
-    assert hyperparameters("ppo", "bus14-R", "paper").actor_learning_rate == 3e-5
-    assert hyperparameters("ppo", "bus14-T0", "paper", seed=8).seed == 8
+# --- Folders that cannot be written or resumed ----------------------------------------------------------------------
 
 
 def test_a_folder_that_exists_is_not_written(tmp_path: Path):

@@ -12,15 +12,15 @@ from rl2grid.agents.random_agent import RandomAgent
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.protocol import evaluate
 from rl2grid.scenarios.library import list_scenarios
-from rl2grid.training import runs, validation
+from rl2grid.training import request, validation
 from rl2grid.training.validation import validator
 
 MONTH = list_scenarios("bus14", "validation")[:1]
 
 
-def a_run(task: str, algorithm: str = "ppo", changes: dict[str, Any] | None = None, **keywords: Any) -> runs.RunArgs:
-    hyperparameters = runs.hyperparameters(algorithm, task, **(changes or {}))
-    return runs.RunArgs(task, hyperparameters, algorithm=algorithm, env_keywords=keywords)
+def a_run(task: str, algorithm: str = "ppo", changes: dict[str, Any] | None = None, **keywords: Any) -> request.RunArgs:
+    hyperparameters = request.hyperparameters(algorithm, task, **(changes or {}))
+    return request.RunArgs(task, hyperparameters, algorithm=algorithm, env_keywords=keywords)
 
 
 @pytest.mark.parametrize("keywords", [{"heuristic": "idle"}, {"heuristic": None, "maintenance": False}])
@@ -42,7 +42,7 @@ def test_safe_months_are_counted_by_the_thresholds_of_the_run(monkeypatch: pytes
     )
     monkeypatch.setattr(validation, "evaluate", lambda *_, **__: replace(played, episodes=episodes))
 
-    def share(args: runs.RunArgs) -> float:
+    def share(args: request.RunArgs) -> float:
         return validator(args)(DoNothing())["safe_completed"]  # type: ignore[arg-type]
 
     assert share(a_run("bus14-T0-TLO")) == 0.5

@@ -90,14 +90,14 @@ def train(command_line: list[str]) -> int:
 def _resume(arguments: list[str]) -> int:
     if not arguments or arguments[0].startswith("-"):
         raise UsageError("Resuming needs one run folder, for example `rl2grid train --resume runs/bus14-T0-v0-ppo-1`.")
-    from rl2grid.training import runs
+    from rl2grid.training import request, runs
     from rl2grid.training.validation import find_validator
 
     path, flags = Path(arguments[0]), arguments[1:]
     _refuse_unknown(flags, [*fields(ResumeFlags)])
     own = _parse("rl2grid train --resume", flags, ResumeFlags())
     limit = TimeLimit(own.max_minutes)
-    args, _ = runs.read_config(path)
+    args, _ = request.read_config(path)
     folder = runs.resume(path, evaluate=find_validator(args), limit=limit)
     return _report(folder, args.task, limit)
 
@@ -105,17 +105,17 @@ def _resume(arguments: list[str]) -> int:
 def _begin(algorithm: str, task_id: str, flags: list[str]) -> int:
     task = find_task(task_id)
     try:
-        from rl2grid.training import runs
+        from rl2grid.training import request, runs
         from rl2grid.training.validation import find_validator
     except ImportError as error:
         raise UsageError(f"Training needs {error.name}: install it with `pip install rl2grid[train]`.") from None
-    hyperparameters = runs.hyperparameters(algorithm, task, _preset(flags))
+    hyperparameters = request.hyperparameters(algorithm, task, _preset(flags))
     _refuse_unknown(flags, [*fields(TrainFlags), *options_without(*GIVEN_OTHERWISE), *fields(hyperparameters)])
     own, keywords, hyperparameters = _parse_all(f"rl2grid train {algorithm} {task.id}", flags, hyperparameters)
     limit = TimeLimit(own.max_minutes)
     keywords["reward"] = reward_of(keywords["reward"])
     options_of(task, keywords)
-    args = runs.RunArgs(
+    args = request.RunArgs(
         task=task,
         hyperparameters=hyperparameters,
         algorithm=algorithm,
@@ -131,7 +131,7 @@ def _begin(algorithm: str, task_id: str, flags: list[str]) -> int:
     try:
         folder = runs.train(args, evaluate=find_validator(args), limit=limit)
     except KeyboardInterrupt:
-        folder = runs.find_folder(args)
+        folder = request.find_folder(args)
         if not folder.exists():
             raise  # the same command begins it
         print(f"rl2grid: interrupted; go on with `rl2grid train --resume {folder}`.", file=sys.stderr)

@@ -73,7 +73,8 @@ def _trained(folder: Path) -> Subject:
     from rl2grid.algorithms.hyperparameters import identifying
     from rl2grid.algorithms.policy_agent import load_agent
     from rl2grid.training.commands import train_command
-    from rl2grid.training.runs import is_finished, read_config
+    from rl2grid.training.request import read_config
+    from rl2grid.training.runs import is_finished
 
     args, identity = read_config(folder)
     if not is_finished(folder):

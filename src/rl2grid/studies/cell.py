@@ -42,7 +42,7 @@ from rl2grid.records.studies import (
     write_result,
 )
 from rl2grid.studies.cells import Cell, Training, cell_from_dict, cell_to_dict
-from rl2grid.training import runs
+from rl2grid.training import request, runs
 from rl2grid.training.commands import train_command
 from rl2grid.training.validation import validator
 
@@ -140,16 +140,16 @@ def _finish(folder: Path) -> None:
 def _train(cell: Cell, training: Training, folder: Path) -> None:
     if folder.exists():
         if not runs.is_finished(folder):
-            runs.resume(folder, evaluate=validator(runs.read_config(folder)[0]))
+            runs.resume(folder, evaluate=validator(request.read_config(folder)[0]))
         return
     args = _run_args(cell, training, folder)
     runs.train(args, evaluate=validator(args))
 
 
-def _run_args(cell: Cell, training: Training, folder: Path) -> runs.RunArgs:
+def _run_args(cell: Cell, training: Training, folder: Path) -> request.RunArgs:
     hyperparameters = training.resolved(cell.task)
     native = cell.environment.get("engine", "native") == "native"
-    return runs.RunArgs(
+    return request.RunArgs(
         task=cell.task,
         hyperparameters=hyperparameters,
         algorithm=training.algorithm,

@@ -12,7 +12,7 @@ from rl2grid.envs.tasks import Task, find_task
 from rl2grid.evaluation.protocol import evenly_spread
 from rl2grid.records.studies import CELLS_FOLDER
 from rl2grid.studies.toml_file import with_tuples
-from rl2grid.training import runs
+from rl2grid.training import request
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Training:
         Raises:
             UsageError: they cannot work, or not for this task.
         """
-        return runs.hyperparameters(self.algorithm, task, self.preset, seed=self.seed, **self.hyperparameters)
+        return request.hyperparameters(self.algorithm, task, self.preset, seed=self.seed, **self.hyperparameters)
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from rl2grid.records.evaluations import Evaluation
 from rl2grid.records.recordings import Recording
 from rl2grid.records.trainings import read_training_curve
 from rl2grid.scenarios.library import list_scenarios
-from rl2grid.training import runs
+from rl2grid.training import request, runs
 from rl2grid.training.validation import validator
 
 TASK = "rl2grid/bus14-T0-v0"
@@ -96,13 +96,13 @@ def _contestants(run: Path) -> list[tuple[str, str | None]]:
 
 def _train(folder: Path, decisions: int) -> Path:
     """Begin the run, or go on with it; a complete run is left as it is."""
-    hyperparameters = runs.hyperparameters("ppo", TASK, total_timesteps=decisions, num_envs=NUM_ENVS)
+    hyperparameters = request.hyperparameters("ppo", TASK, total_timesteps=decisions, num_envs=NUM_ENVS)
     if folder.exists():
-        stored, _ = runs.read_config(folder)
+        stored, _ = request.read_config(folder)
         if stored.hyperparameters != hyperparameters:
             raise UsageError(f"{folder} holds another training: remove it, or choose another folder with --output.")
         return runs.resume(folder, evaluate=validator(stored))
-    args = runs.RunArgs(
+    args = request.RunArgs(
         task=find_task(TASK),
         hyperparameters=hyperparameters,
         folder=folder,

@@ -38,10 +38,10 @@ from rl2grid.records.metrics import read_validations
 from rl2grid.records.searches import read_search, write_best, write_search
 from rl2grid.studies.cell import STOPPED, CellProcess, is_busy, serve
 from rl2grid.studies.tuning import Tuning, kinds_of, run_args
-from rl2grid.training import runs
+from rl2grid.training import request, runs
 from rl2grid.training.commands import train_command
 from rl2grid.training.interrupts import stop_requests
-from rl2grid.training.validation import validator
+from rl2grid.training.validation import score, validator
 
 JOURNAL_FILE = "journal.log"
 TRIALS_FOLDER = "trials"
@@ -111,7 +111,7 @@ def best_command(tuning: Tuning, best: Best) -> str:
     """What to type to train with a configuration."""
     args = run_args(tuning, tuning.resolved(best.hyperparameters), None)
     # Validated on all months, and not as often as while searching, where that is for ending poor trials.
-    args = replace(args, evaluate_every=runs.RunArgs.evaluate_every, validation_months=None)
+    args = replace(args, evaluate_every=request.RunArgs.evaluate_every, validation_months=None)
     return train_command(args, tuning.preset)
 
 
@@ -162,7 +162,7 @@ def _train(tuning: Tuning, trial: Any, chosen: Mapping[str, Any]) -> float:
     trial.set_user_attr("run", folder.name)
     args = run_args(tuning, hyperparameters, folder)
     validate = validator(args)
-    reports = Reports(trial, folder, runs.find_limits(args))
+    reports = Reports(trial, folder, request.find_limits(args))
     if _was_pruned(trial.study, folder):
         raise optuna.TrialPruned
 
@@ -219,11 +219,11 @@ class Reports:
 
 
 def one_score(means: Mapping[str, float], limits: Mapping[str, float]) -> float:
-    """:func:`rl2grid.training.runs.score` as one number in the same order, as searches need it.
+    """:func:`rl2grid.training.validation.score` as one number in the same order, as searches need it.
 
     Shares of safe episodes of fewer than 1,000 episodes differ by more than the last weight.
     """
-    first, *then = runs.score(means, limits)
+    first, *then = score(means, limits)
     return first + sum(1e-3 * value for value in then)
 
 

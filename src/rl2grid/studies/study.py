@@ -50,7 +50,7 @@ from rl2grid.studies.toml_file import (
     upper,
     with_tuples,
 )
-from rl2grid.training import runs
+from rl2grid.training import request
 
 NO_HEURISTIC = "none"
 DEFAULT_RETRIES = 2
@@ -267,7 +267,7 @@ def _check_training_and_constraint(cell: Cell) -> None:
         constraint_of(cell.task, cell.environment.get("constraint"))
         return
     hyperparameters, algorithm = cell.training.resolved(cell.task), cell.training.algorithm
-    runs.find_limits(runs.RunArgs(cell.task, hyperparameters, algorithm, env_keywords=cell.environment))
+    request.find_limits(request.RunArgs(cell.task, hyperparameters, algorithm, env_keywords=cell.environment))
 
 
 def _chosen_scale(scales: Mapping[str, Any], asked: str | None) -> str | None:

@@ -14,7 +14,7 @@ from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
 from rl2grid.studies.study import NO_HEURISTIC
 from rl2grid.studies.toml_file import as_table, check_kind, count, read_toml, refuse_unknown_keys, text, unknown
-from rl2grid.training import runs
+from rl2grid.training import request
 
 TRANSITIONS = "num_envs * num_steps"
 """Name of a parameter that the paper searched in place of ``num_steps``."""
@@ -77,9 +77,9 @@ class Tuning:
         if transitions is not None:
             num_envs = changes.get("num_envs")
             if num_envs is None:
-                num_envs = runs.hyperparameters(self.algorithm, self.task, self.preset).num_envs
+                num_envs = request.hyperparameters(self.algorithm, self.task, self.preset).num_envs
             changes["num_steps"] = max(int(transitions) // num_envs, 1)
-        return runs.hyperparameters(self.algorithm, self.task, self.preset, **fixed, **changes)
+        return request.hyperparameters(self.algorithm, self.task, self.preset, **fixed, **changes)
 
 
 def load_tuning(file: str, output: Path | None = None) -> Tuning:
@@ -142,9 +142,9 @@ def _default_space(algorithm: str, fixed: Mapping[str, Any]) -> dict[str, list[A
     return {name: values for name, values in search_space(algorithm).items() if name not in without}
 
 
-def run_args(tuning: Tuning, hyperparameters: Hyperparameters, folder: Path | None) -> runs.RunArgs:
+def run_args(tuning: Tuning, hyperparameters: Hyperparameters, folder: Path | None) -> request.RunArgs:
     """The training of a trial, in ``folder``; None: the usual one."""
-    return runs.RunArgs(
+    return request.RunArgs(
         task=tuning.task,
         hyperparameters=hyperparameters,
         algorithm=tuning.algorithm,
@@ -221,7 +221,7 @@ def _check_choices(tuning: Tuning) -> None:
 def _refusal(tuning: Tuning, chosen: Mapping[str, Any]) -> UsageError | None:
     """Why a configuration cannot be trained; None if it can."""
     try:
-        runs.find_limits(run_args(tuning, tuning.resolved(chosen), None))
+        request.find_limits(run_args(tuning, tuning.resolved(chosen), None))
     except UsageError as error:
         return error
     return None

@@ -8,10 +8,10 @@ from pathlib import Path
 
 from rl2grid.envs.tasks import short_id
 from rl2grid.evaluation.flags import environment_flags, flags
-from rl2grid.training import runs
+from rl2grid.training import request
 
 
-def train_command(args: runs.RunArgs, preset: str = "default", folder: Path | None = None) -> str:
+def train_command(args: request.RunArgs, preset: str = "default", folder: Path | None = None) -> str:
     """The shortest ``rl2grid train`` that makes a run again: everything that its preset does not say.
 
     The number of PyTorch's threads and the device are in it, because results are the same bit for bit for these only;
@@ -24,10 +24,10 @@ def train_command(args: runs.RunArgs, preset: str = "default", folder: Path | No
     """
     words = ["rl2grid", "train", args.algorithm, short_id(args.task.id)]
     words += ["--preset", preset] if preset != "default" else []
-    chosen, original = asdict(args.hyperparameters), asdict(runs.hyperparameters(args.algorithm, args.task, preset))
+    chosen, original = asdict(args.hyperparameters), asdict(request.hyperparameters(args.algorithm, args.task, preset))
     changes = {name: value for name, value in chosen.items() if value != original[name]}
     words += [*environment_flags(args.env_keywords), *flags(changes)]
-    if args.evaluate_every != runs.RunArgs.evaluate_every:
+    if args.evaluate_every != request.RunArgs.evaluate_every:
         words += ["--evaluate-every", str(args.evaluate_every)]
     if args.validation_months is not None:
         words += ["--validation-months", str(args.validation_months)]
@@ -41,5 +41,5 @@ def training_command(folder: Path) -> str:
     Raises:
         UsageError: the folder holds no run.
     """
-    args, _ = runs.read_config(folder)
+    args, _ = request.read_config(folder)
     return train_command(args, folder=folder)

@@ -6,7 +6,7 @@ A run folder holds
 - ``metrics.csv`` and ``tensorboard/``: see :mod:`rl2grid.algorithms.metrics`;
 - ``checkpoint.pt``: everything needed to go on, see :mod:`rl2grid.algorithms.checkpoint`;
 - ``replay/``: what DQN, SAC and TD3 remember, until the run is finished, see :mod:`rl2grid.algorithms.replay`;
-- ``best.pt``: the best policy on the validation scenarios so far, see :func:`score`;
+- ``best.pt``: the best policy on the validation scenarios so far, see :func:`rl2grid.training.validation.score`;
 - ``energy.json``: energy and CO2, see :mod:`rl2grid.training.energy`;
 - ``wandb.json``, ``wandb/``: of a tracked run, see :mod:`rl2grid.training.tracking`;
 - ``log.txt``: what happened when.
@@ -17,12 +17,11 @@ the same metrics as one that was not (times apart), on the same machine with the
 
 from __future__ import annotations
 
-import json
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -33,127 +32,32 @@ from filelock import FileLock, Timeout
 from rl2grid.algorithms.checkpoint import load_checkpoint, save_checkpoint
 from rl2grid.algorithms.metrics import MetricsWriter
 from rl2grid.algorithms.policy_agent import BEST_FILE, CHECKPOINT_FILE, PolicyAgent
-from rl2grid.algorithms.registry import (
-    Algorithm,
-    Hyperparameters,
-    VectorEnvironment,
-    algorithms_for,
-    find_algorithm,
-)
+from rl2grid.algorithms.registry import VectorEnvironment, find_algorithm
 from rl2grid.algorithms.trainer import Trainer
-from rl2grid.envs.options import TaskOptions
 from rl2grid.envs.registration import register_all
-from rl2grid.envs.tasks import Task, constraint_of, find_task
-from rl2grid.errors import UsageError, one_of
-from rl2grid.evaluation.protocol import evenly_spread
-from rl2grid.mdp.actions import action_set_hash
-from rl2grid.mdp.constraint_table import CONSTRAINTS, THRESHOLDS
-from rl2grid.records.trainings import RUN_FILE, create_run_folder, read_configuration
-from rl2grid.records.versions import library_versions
-from rl2grid.scenarios.library import check_in_split, generator_version, scenario_pack_hash
-from rl2grid.scenarios.splits import TRAIN, VALIDATION
+from rl2grid.errors import UsageError
+from rl2grid.records.trainings import create_run_folder
 from rl2grid.training.energy import EnergyAccount
 from rl2grid.training.interrupts import stop_requests
 from rl2grid.training.limits import TimeLimit
 from rl2grid.training.progress import progress_bar
+from rl2grid.training.request import (
+    RunArgs,
+    complete,
+    configuration_of,
+    find_limits,
+    identity_of,
+    read_config,
+    stored_request,
+)
 from rl2grid.training.tracking import check_tracking, tracked
+from rl2grid.training.validation import Evaluate, score
 
 LOG_FILE = "log.txt"
 LOCK_FILE = ".lock"
 REPLAY_FOLDER = "replay"
 
 UNLIMITED = TimeLimit(None)
-
-Evaluate = Callable[[PolicyAgent], Mapping[str, float]]
-"""Plays the validation scenarios and returns means over them: ``survival``, under constraints also
-``safe_completed``, and whatever else is to be recorded."""
-
-
-@dataclass(frozen=True)
-class RunArgs:
-    """What is to be trained, on what, and where."""
-
-    task: Task
-    """May be given by its id, such as ``rl2grid/bus14-T0-v0``, whose namespace and version may be left out."""
-    hyperparameters: Hyperparameters
-    """Of the algorithm, the seed and the budget among them; see :func:`hyperparameters`."""
-    algorithm: str = "ppo"
-    """Name of the algorithm."""
-    folder: Path | None = None
-    """Where the run is written, a folder that does not exist yet; None: ``runs/<task>-<algorithm>-<seed>``."""
-    env_keywords: Mapping[str, Any] = field(default_factory=dict)
-    """Keywords of ``gymnasium.make_vec`` (``heuristic``, ``reward``, ...); ``gamma`` is the algorithm's."""
-    num_threads: int | None = None
-    """Native engine: threads that play the environments; None: one per processor core. No influence on results."""
-    num_workers: int | None = None
-    """Reference engine: processes that play them; None: one per core, 0: this one. No influence on results."""
-    checkpoint_seconds: float = 60.0
-    """A checkpoint is written when the last one is older than this, and at the end."""
-    evaluate_every: int = 50_000
-    """Decisions between two evaluations on the validation scenarios; there is one more at the end."""
-    validation_months: int | None = None
-    """Validation scenarios that are played, evenly spread; None: all; 0: none, so that there is no ``best.pt``."""
-    tensorboard: bool = True
-    """Whether to write TensorBoard events beside ``metrics.csv``."""
-    wandb_project: str | None = None
-    """Project of Weights & Biases that gets the metrics; None: they stay here."""
-    progress: bool = True
-    """Whether to show a progress bar."""
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "task", find_task(self.task))
-
-
-def hyperparameters(algorithm: str, task: Task | str, preset: str = "default", **changes: Any) -> Hyperparameters:
-    """A preset of an algorithm for a task, some values changed.
-
-    Raises:
-        UsageError: no such algorithm, task, preset or hyperparameter, or an algorithm that cannot learn the task.
-    """
-    task = find_task(task)
-    chosen = _checked_algorithm(algorithm, task)
-    known = [parameter.name for parameter in fields(chosen.args)]
-    for name in changes:
-        if name not in known:
-            raise one_of(f"Hyperparameter of {algorithm}", name, known)
-    resolved: Hyperparameters = chosen.preset(preset, continuous=task.kind == "R", **changes)
-    return resolved
-
-
-def find_limits(args: RunArgs) -> dict[str, float]:
-    """What the costs of a safe episode may reach, by constraint; empty without a constraint.
-
-    The constraint is the task's, or that of the keyword ``constraint``; an algorithm may have others of its own.
-
-    Raises:
-        UsageError: Lagrangian PPO without a constraint, or with one whose costs the environments do not report, or a
-            keyword that contradicts the task's id.
-    """
-    constraint = constraint_of(args.task, args.env_keywords.get("constraint"))
-    algorithm = find_algorithm(args.algorithm)
-    if algorithm.find_limits is not None:
-        limits = algorithm.find_limits(args.hyperparameters, constraint)
-        for name in limits:
-            if name not in CONSTRAINTS:
-                raise one_of("Constraint", name, tuple(CONSTRAINTS))
-        return limits
-    return {constraint: THRESHOLDS[constraint]} if constraint else {}
-
-
-def find_folder(args: RunArgs) -> Path:
-    """Where a run is written."""
-    task = args.task.id.removeprefix("rl2grid/")
-    return Path(args.folder or Path("runs") / f"{task}-{args.algorithm}-{args.hyperparameters.seed}")
-
-
-def score(means: Mapping[str, float], limits: Mapping[str, float]) -> tuple[float, ...]:
-    """What the best policy has most of, in the order of importance; of equals the latest is kept.
-
-    Under constraints the share of validation episodes that were completed within all ``limits``, then survival;
-    without any, survival.
-    """
-    names = ("safe_completed", "survival") if limits else ("survival",)
-    return tuple(float(means[name]) for name in names)
 
 
 def make_envs(args: RunArgs) -> VectorEnvironment:
@@ -190,7 +94,7 @@ def train(
     Raises:
         UsageError: the request cannot be met; nothing was written.
     """
-    args = _resolved(args)
+    args = complete(args)
     folder = args.folder
     assert folder is not None
     if folder.exists():
@@ -198,8 +102,8 @@ def train(
     envs = make_envs(args)
     try:
         trainer = find_algorithm(args.algorithm).trainer(args.hyperparameters, envs)
-        identity = _identity(args)
-        create_run_folder(folder, _configuration(args, identity))
+        identity = identity_of(args)
+        create_run_folder(folder, configuration_of(args, identity))
         with _locked(folder):
             _run(_Run(folder, args, identity, trainer, evaluate), envs, limit, None)
     finally:
@@ -222,7 +126,7 @@ def resume(
     args, identity = read_config(folder)
     check_tracking(args.wandb_project)
     with _locked(folder):
-        now = _identity(args)
+        now = identity_of(args)
         for name in ("grid_hash", "scenario_pack_hash", "action_set_hash"):
             if identity.get(name) != now.get(name):
                 raise UsageError(
@@ -242,27 +146,6 @@ def resume(
         finally:
             envs.close()
     return folder
-
-
-def read_config(folder: Path) -> tuple[RunArgs, dict[str, Any]]:
-    """The request and the identity stored in a run folder.
-
-    Raises:
-        UsageError: the folder holds no run.
-    """
-    try:
-        config = read_configuration(folder)
-        request = dict(config["request"])
-        algorithm = find_algorithm(request["algorithm"])
-        request["hyperparameters"] = algorithm.args(**_tuples(request["hyperparameters"]))
-        request["env_keywords"] = _tuples(request["env_keywords"])
-        return RunArgs(**request, folder=folder), config["identity"]
-    except FileNotFoundError as error:
-        raise UsageError(f"Folder {str(folder)!r} holds no run: there is no {RUN_FILE} in it.") from error
-    except (json.JSONDecodeError, KeyError, TypeError) as error:
-        raise UsageError(
-            f"File {str(folder / RUN_FILE)!r} does not describe a run of this version of rl2grid."
-        ) from error
 
 
 def is_finished(folder: Path) -> bool:
@@ -289,7 +172,7 @@ class _Run:
         self.evaluate = evaluate
         self.limits = find_limits(args)
         self.best_score: tuple[float, ...] | None = None
-        """Of ``best.pt``; see :func:`score`."""
+        """Of ``best.pt``."""
         self.wall_time = 0.0
         """Seconds of training and validation, those before interruptions included."""
 
@@ -363,7 +246,7 @@ def _run(run: _Run, envs: VectorEnvironment, limit: TimeLimit, checkpoint: Mappi
     run.note(f"{'resumed' if checkpoint else 'started'} at {trainer.decisions} of {_budget(args, trainer)} decisions")
     after_step = trainer.decisions if checkpoint is not None else -1
     saved_at, saved_decisions = time.monotonic(), trainer.decisions
-    config = {"request": _request(args), "identity": dict(run.identity)}
+    config = {"request": stored_request(args), "identity": dict(run.identity)}
     title = f"{args.algorithm} on {args.task.id}"
     with (
         closing(MetricsWriter(run.folder, after_step=after_step, tensorboard=args.tensorboard)) as metrics,
@@ -417,79 +300,6 @@ def _budget(args: RunArgs, trainer: Trainer) -> int:
     return trainer.num_iterations * args.hyperparameters.num_envs * args.hyperparameters.num_steps
 
 
-def _resolved(args: RunArgs) -> RunArgs:
-    """The same request with everything filled in that a default decides, checked."""
-    task = args.task
-    _checked_algorithm(args.algorithm, task)
-    keywords = dict(args.env_keywords)
-    if "gamma" in keywords:
-        raise UsageError("gamma belongs to the algorithm's hyperparameters, not to the environment's keywords.")
-    allowed = [option.name for option in fields(TaskOptions) if option.name != "gamma"]
-    for name in keywords:
-        if name not in allowed:
-            raise one_of("Environment keyword", name, allowed)
-    if callable(keywords.get("reward")):
-        raise UsageError("A run stores its reward by name: choose a preset or three weights, not a function.")
-    # Every keyword is stored, so that the run stays what it is when a default changes.
-    keywords = {name: getattr(TaskOptions(**keywords), name) for name in allowed}
-    if keywords["split"] != TRAIN:
-        raise UsageError(f"Training on the {keywords['split']} scenarios is refused: choose split {TRAIN!r}.")
-    if keywords["scenario"] is not None:
-        check_in_split(task.grid_id, TRAIN, keywords["scenario"])
-    if args.evaluate_every < 1:
-        raise UsageError(f"evaluate_every must be at least 1 decision, not {args.evaluate_every}.")
-    if args.validation_months != 0:
-        evenly_spread(task, VALIDATION, args.validation_months)
-    check_tracking(args.wandb_project)
-    resolved = replace(args, folder=find_folder(args), env_keywords=keywords)
-    find_limits(resolved)  # refuses what cannot be constrained
-    return resolved
-
-
-def _checked_algorithm(name: str, task: Task) -> Algorithm:
-    algorithm = find_algorithm(name)
-    if task.kind not in algorithm.kinds:
-        able = algorithms_for(task.kind)
-        raise UsageError(
-            f"Algorithm {name!r} cannot learn {task.id}, which has {_ACTIONS[task.kind]} actions: "
-            f"choose one of {', '.join(able)}."
-        )
-    return algorithm
-
-
-_ACTIONS = {"T": "discrete", "R": "continuous"}
-
-
-def _identity(args: RunArgs) -> dict[str, Any]:
-    """What results of this run must name (the normaliser's hash changes with training: checkpoints know it)."""
-    task = args.task
-    return {
-        "task": task.id,
-        "engine": args.env_keywords["engine"],
-        "grid_hash": task.grid.hash,
-        "generator_version": generator_version(task.grid_id, args.env_keywords["split"]),
-        "scenario_pack_hash": scenario_pack_hash(task.grid_id, args.env_keywords["split"]),
-        "action_set_hash": action_set_hash(task.grid, task.level) if task.kind == "T" else None,
-        "versions": library_versions(),
-        "seed": args.hyperparameters.seed,
-    }
-
-
-def _configuration(args: RunArgs, identity: Mapping[str, Any]) -> dict[str, Any]:
-    seeds = {
-        "algorithm": args.hyperparameters.seed,
-        "first_environment": args.hyperparameters.seed * args.hyperparameters.num_envs,
-    }
-    return {"request": _request(args), "identity": dict(identity), "seeds": seeds}
-
-
-def _request(args: RunArgs) -> dict[str, Any]:
-    """The request as it is stored: wherever the folder is, it is the same run."""
-    request = asdict(args)
-    del request["folder"]
-    return request | {"task": args.task.id}
-
-
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
     """Keep other processes from writing into a run folder; the lock goes with this process, however it ends."""
@@ -502,8 +312,3 @@ def _locked(folder: Path) -> Iterator[None]:
         yield
     finally:
         lock.release()
-
-
-def _tuples(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Values read from JSON, where tuples are stored as lists."""
-    return {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}

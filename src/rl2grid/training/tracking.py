@@ -12,8 +12,6 @@ from typing import Any
 from rl2grid.errors import UsageError
 from rl2grid.records.trainings import read_tracking, write_tracking
 
-"""In a run folder: the id under which Weights & Biases knows the run."""
-
 Track = Callable[[int, Mapping[str, float]], None]
 """Takes the decisions made so far and the metrics at that point."""
 
