@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from test_runs import toy_envs
+from toy_runs import toy_envs
 
 from rl2grid.cli import train as command
 from rl2grid.cli.keywords import NAMES

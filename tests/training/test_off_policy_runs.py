@@ -2,49 +2,27 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
-from test_runs import assert_same_run, environment, falling, request, table, toy_envs
+from killed_runs import KILLED, run_until_killed
+from toy_runs import LAYERS, SIZES, assert_same_run, falling, request, table, toy_envs, toy_run
 
 from rl2grid.algorithms.checkpoint import load_checkpoint
 from rl2grid.algorithms.policy_agent import load_agent
 from rl2grid.errors import UsageError
-from rl2grid.training.request import RunArgs, hyperparameters, read_config
+from rl2grid.training.request import hyperparameters, read_config
 from rl2grid.training.runs import resume, train
 
-SIZES: dict[str, Any] = {
-    "seed": 5,
-    "total_timesteps": 4 * 8 * 12,
-    "num_envs": 4,
-    "num_steps": 8,
-    "learning_starts": 40,
-    "batch_size": 8,
-    "buffer_size": 160,
-    "gamma": 0.9,
-}
-LAYERS: dict[str, dict[str, Any]] = {
-    "dqn": {"layers": (8,)},
-    "sac": {"actor_layers": (8,), "critic_layers": (8,)},
-    "td3": {"actor_layers": (8,), "critic_layers": (8,)},
-}
 CASES = [("dqn", "bus14-T0"), ("sac", "bus14-T0"), ("sac", "bus14-R"), ("td3", "bus14-R")]
 ALL = pytest.mark.parametrize(("algorithm", "task"), CASES)
 
 
-def off_policy(folder: Path, algorithm: str, task: str, **changes: Any) -> RunArgs:
-    args = hyperparameters(algorithm, task, **SIZES, **LAYERS[algorithm], **changes)
-    return request(folder, algorithm=algorithm, task=task, hyperparameters=args)
-
-
 @ALL
 def test_a_run_folder_holds_everything_about_the_run(tmp_path: Path, algorithm: str, task: str):
-    asked = off_policy(tmp_path / "run", algorithm, task)
+    asked = toy_run(tmp_path / "run", algorithm, task)
     folder = train(asked, evaluate=falling, make_envs=toy_envs)
     present = {path.name for path in folder.iterdir()} - {".lock"}
     assert present == {
@@ -64,77 +42,19 @@ def test_a_run_folder_holds_everything_about_the_run(tmp_path: Path, algorithm: 
     assert {"charts/survival", "charts/episodic_return", "losses/qf_loss", "losses/qf_values"} <= names
 
 
-RUNNER = """
-import os, sys
-from pathlib import Path
-import torch
-from test_off_policy_runs import off_policy
-from test_runs import falling, toy_envs
-from rl2grid.algorithms import checkpoint, replay
-from rl2grid.training import runs
-
-folder, algorithm, task, share, kill = Path(sys.argv[1]), *sys.argv[2:]
-place, _, count = kill.partition(":")
-calls = 0
-
-def at(place_now):
-    global calls
-    if place_now == place:
-        calls += 1
-        if calls == int(count):
-            os._exit(9)
-
-def save(value, file, original=torch.save):
-    at("before-write")
-    original(value, file)
-    at("mid-write")
-
-def rename(source, target, original=os.replace):
-    at("before-replace")
-    original(source, target)
-    at("after-replace")
-
-def write(path, position, content, original=replay._write_at):
-    if place == "mid-replay" and calls + 1 == int(count):
-        original(path, position, content[: len(content) // 2])
-    at("mid-replay")
-    original(path, position, content)
-
-def add(self, step, original=replay.ReplayMemory.add):
-    at("before-step")
-    original(self, step)
-
-torch.save = save
-checkpoint.os.replace = rename
-replay._write_at = write
-replay.ReplayMemory.add = add
-if folder.exists():
-    runs.resume(folder, evaluate=falling, make_envs=toy_envs)
-else:
-    request = off_policy(folder, algorithm, task, buffer_memory_share=float(share))
-    runs.train(request, evaluate=falling, make_envs=toy_envs)
-"""
-
-
-def run_until_killed(folder: Path, algorithm: str, task: str, share: float, kill: str) -> int:
-    paths = [str(Path(__file__).parent), environment()["PYTHONPATH"]]
-    command = [sys.executable, "-c", RUNNER, str(folder), algorithm, task, str(share), kill]
-    return subprocess.run(command, env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)}).returncode
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("share", [0.0, 0.25], ids=["mapped", "memory"])
 @ALL
 def test_a_run_killed_at_the_worst_moments_ends_like_one_that_was_not(
     tmp_path: Path, algorithm: str, task: str, share: float
 ):
-    asked = off_policy(tmp_path / "straight", algorithm, task, buffer_memory_share=share)
+    asked = toy_run(tmp_path / "straight", algorithm, task, buffer_memory_share=share)
     straight = train(asked, evaluate=falling, make_envs=toy_envs)
     kills = ["before-step:37", "before-write:2", "after-replace:3", "before-replace:4", "mid-write:1"]
     if share:
         kills.insert(1, "mid-replay:2")
     for kill in kills:
-        assert run_until_killed(tmp_path / "run", algorithm, task, share, kill) == 9, kill
+        assert run_until_killed(tmp_path / "run", kill, algorithm, task, buffer_memory_share=share) == KILLED, kill
     resume(tmp_path / "run", evaluate=falling, make_envs=toy_envs)
     assert_same_run(tmp_path / "run", straight)
 
@@ -149,9 +69,9 @@ def test_a_run_broken_off_and_resumed_ends_like_one_that_was_not(tmp_path: Path,
             raise BrokenOffError
         return falling(agent)
 
-    straight = train(off_policy(tmp_path / "straight", algorithm, task), evaluate=falling, make_envs=toy_envs)
+    straight = train(toy_run(tmp_path / "straight", algorithm, task), evaluate=falling, make_envs=toy_envs)
     with pytest.raises(BrokenOffError):
-        train(off_policy(tmp_path / "run", algorithm, task), evaluate=break_off, make_envs=toy_envs)
+        train(toy_run(tmp_path / "run", algorithm, task), evaluate=break_off, make_envs=toy_envs)
     assert any((tmp_path / "run" / "replay").glob("*.rows"))
     checkpoint = load_checkpoint(tmp_path / "run" / "checkpoint.pt")
     assert checkpoint["decisions"] == 160
@@ -165,7 +85,7 @@ def test_the_replay_memory_is_needed_to_resume(tmp_path: Path):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train(off_policy(tmp_path / "run", "dqn", "bus14-T0"), evaluate=stop, make_envs=toy_envs)
+        train(toy_run(tmp_path / "run", "dqn", "bus14-T0"), evaluate=stop, make_envs=toy_envs)
     for path in (tmp_path / "run" / "replay").glob("*.rows"):
         path.unlink()
     with pytest.raises(UsageError, match="is missing or too short: the run cannot be resumed"):
@@ -176,7 +96,7 @@ def test_impossible_pairs_are_refused_before_anything_is_made(tmp_path: Path):
     for algorithm, task in (("td3", "bus14-T0"), ("dqn", "bus14-R")):
         with pytest.raises(UsageError, match=f"'{algorithm}' cannot learn .*: choose one of ppo, "):
             hyperparameters(algorithm, task)
-        other = off_policy(tmp_path / "run", *CASES[0 if algorithm == "dqn" else 3])
+        other = toy_run(tmp_path / "run", *CASES[0 if algorithm == "dqn" else 3])
         with pytest.raises(UsageError, match="cannot learn"):
             train(replace(other, task=task), make_envs=toy_envs)
     assert list(tmp_path.iterdir()) == []

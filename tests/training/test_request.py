@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from test_runs import SMALL, request, toy_envs
+from toy_runs import SMALL, request, toy_envs
 
 from rl2grid.envs.tasks import find_task
 from rl2grid.errors import UsageError

@@ -11,7 +11,7 @@ from typing import Any
 
 import pandas as pd
 import pytest
-from test_runs import assert_same_run, falling, request, toy_envs
+from toy_runs import assert_same_run, falling, request, toy_envs
 
 from rl2grid.errors import UsageError
 from rl2grid.training.energy import CO2_PER_KWH, WATTS_PER_CORE, energy_line

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import json
-import os
 import random
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -18,84 +16,16 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from killed_runs import KILLED, run_until_killed
 from toy_grid import ToyGrid
+from toy_runs import SMALL, assert_same, assert_same_run, environment, falling, request, toy_envs
 
-import rl2grid
 from rl2grid.algorithms.checkpoint import load_checkpoint, save_checkpoint
 from rl2grid.algorithms.policy_agent import PolicyAgent, load_agent
 from rl2grid.algorithms.ppo import Args
 from rl2grid.errors import UsageError
 from rl2grid.training.request import RunArgs, hyperparameters
 from rl2grid.training.runs import is_finished, resume, train
-
-SMALL = Args(
-    seed=5,
-    total_timesteps=4 * 8 * 12,
-    num_envs=4,
-    num_steps=8,
-    gamma=0.9,
-    update_epochs=2,
-    actor_layers=(8,),
-    critic_layers=(8,),
-)
-TIMES = ["charts/SPS", "charts/grid_SPS", "charts/environment_share"]
-
-
-def request(folder: Path, **changes: Any) -> RunArgs:
-    request = RunArgs(
-        task="bus14-T0",
-        hyperparameters=SMALL,
-        folder=folder,
-        env_keywords={"heuristic": "idle", "reward": (1.0, 0.5, 0.25)},
-        checkpoint_seconds=0.0,
-        evaluate_every=96,
-        tensorboard=False,
-        progress=False,
-    )
-    return replace(request, **changes)
-
-
-def toy_envs(args: RunArgs) -> ToyGrid:
-    continuous = args.task.kind == "R"
-    return ToyGrid(args.hyperparameters.num_envs, gamma=args.hyperparameters.gamma, continuous=continuous)
-
-
-def falling(agent: PolicyAgent) -> Mapping[str, float]:
-    """A validation that likes the policy after 96 decisions best."""
-    return {"survival": 1.0 - abs(agent.identity["decisions"] - 96) / 1000, "return": 2.0}
-
-
-def table(folder: Path) -> pd.DataFrame:
-    """The metrics of a run that do not depend on the speed of the machine."""
-    metrics = pd.read_csv(folder / "metrics.csv").drop(columns="wall_time")
-    return metrics[~metrics["name"].isin(TIMES)].reset_index(drop=True)
-
-
-def assert_same_run(mine: Path, theirs: Path) -> None:
-    """The same weights, optimiser, random states, environments, counters, metrics and best policy."""
-    assert_same(*(load_checkpoint(folder / "checkpoint.pt")["training"] for folder in (mine, theirs)))
-    assert_same(*(load_checkpoint(folder / "checkpoint.pt")["policy"] for folder in (mine, theirs)))
-    pd.testing.assert_frame_equal(table(mine), table(theirs), check_exact=True)
-    if (theirs / "best.pt").exists():
-        assert_same(*(load_checkpoint(folder / "best.pt")["policy"] for folder in (mine, theirs)))
-
-
-def assert_same(mine: Any, theirs: Any, where: str = "") -> None:
-    if isinstance(mine, dict):
-        assert mine.keys() == theirs.keys(), where
-        for key in mine:
-            assert_same(mine[key], theirs[key], f"{where}/{key}")
-    elif isinstance(mine, list | tuple):
-        assert len(mine) == len(theirs), where
-        for k, (one, other) in enumerate(zip(mine, theirs, strict=True)):
-            assert_same(one, other, f"{where}/{k}")
-    elif isinstance(mine, torch.Tensor | np.ndarray):
-        assert type(mine) is type(theirs), where
-        assert mine.dtype == theirs.dtype, where
-        equal = torch.equal if isinstance(mine, torch.Tensor) else np.array_equal
-        assert equal(mine, theirs), where
-    else:
-        assert str(mine) == str(theirs), where
 
 
 def test_runs_that_differ_in_one_element_are_not_the_same():
@@ -313,94 +243,6 @@ def test_a_finished_run_stays_as_it_is(tmp_path: Path):
     assert {name: (folder / name).read_bytes() for name in before} == before
 
 
-RUNNER = '''
-import os, sys
-from pathlib import Path
-import torch
-from test_runs import falling, request, toy_envs
-from rl2grid.algorithms import checkpoint
-from rl2grid.records import metrics
-from rl2grid.algorithms.registry import find_algorithm
-from rl2grid.training import runs
-
-folder, kill = Path(sys.argv[1]), sys.argv[2]
-place, _, count = kill.partition(":")
-calls = 0
-
-def at(place_now):
-    """Die like a killed process at the given call."""
-    global calls
-    if place_now == place:
-        calls += 1
-        if calls == int(count):
-            os._exit(9)
-
-def save(value, file, original=torch.save):
-    at("before-write")
-    original(value, file)
-    if place == "mid-write" and calls + 1 == int(count):
-        file.truncate(file.tell() // 2)
-        file.flush()
-    at("mid-write")
-
-def replace(source, target, original=os.replace):
-    at("before-replace")
-    original(source, target)
-    at("after-replace")
-
-class Csv:
-    """Dies having written half of a row."""
-    def __init__(self, file): self.file = file
-    def write(self, text):
-        if place == "mid-row" and calls + 1 == int(count):
-            self.file.write(text[: len(text) // 2])
-            self.file.flush()
-        at("mid-row")
-        return self.file.write(text)
-    def flush(self): self.file.flush()
-    def close(self): self.file.close()
-
-def writer(self, *arguments, original=metrics.MetricsFile.__init__, **keywords):
-    original(self, *arguments, **keywords)
-    self._file = Csv(self._file)
-    self._csv = metrics.csv.writer(self._file, lineterminator="\\n")
-
-torch.save = save
-checkpoint.os.replace = replace
-metrics.MetricsFile.__init__ = writer
-# Iterations as long as those of a small task, for the kills from outside.
-iterate = find_algorithm("ppo").trainer.iterate
-def slow(self):
-    import time
-    time.sleep(0.02)
-    return iterate(self)
-find_algorithm("ppo").trainer.iterate = slow
-print("ready", flush=True)
-if folder.exists():
-    runs.resume(folder, evaluate=falling, make_envs=toy_envs)
-else:
-    runs.train(request(folder), evaluate=falling, make_envs=toy_envs)
-'''
-
-
-def environment() -> dict[str, str]:
-    paths = [Path(rl2grid.__file__).parents[1], Path(__file__).parent, Path(__file__).parents[1]]
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, paths))}
-
-
-def run_until_killed(folder: Path, kill: str, *, after_seconds: float | None = None) -> int:
-    """Train or resume in a process of its own; returns its exit status."""
-    with subprocess.Popen(
-        [sys.executable, "-c", RUNNER, str(folder), kill], env=environment(), stdout=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "ready\n"
-        if after_seconds is not None:
-            time.sleep(after_seconds)
-            process.kill()
-        return process.wait()
-
-
 @pytest.mark.parametrize(
     "kills",
     [
@@ -412,7 +254,7 @@ def run_until_killed(folder: Path, kill: str, *, after_seconds: float | None = N
 def test_a_run_killed_at_the_worst_moments_ends_like_one_that_was_not(tmp_path: Path, kills: list[str]):
     straight = train(request(tmp_path / "straight"), evaluate=falling, make_envs=toy_envs)
     for kill in kills:
-        assert run_until_killed(tmp_path / "run", kill) == 9
+        assert run_until_killed(tmp_path / "run", kill) == KILLED
     resume(tmp_path / "run", evaluate=falling, make_envs=toy_envs)
     assert_same_run(tmp_path / "run", straight)
 
@@ -421,7 +263,7 @@ def test_a_run_killed_at_random_moments_ends_like_one_that_was_not(tmp_path: Pat
     straight = train(request(tmp_path / "straight"), evaluate=falling, make_envs=toy_envs)
     for attempt in range(2):
         seconds = random.uniform(0.0, 0.35)
-        status = run_until_killed(tmp_path / "run", "never:1", after_seconds=seconds)
+        status = run_until_killed(tmp_path / "run", after_seconds=seconds)
         print(f"attempt {attempt}: killed after {seconds:.3f} s, exit status {status}")
     if not (tmp_path / "run").exists():
         train(request(tmp_path / "run"), evaluate=falling, make_envs=toy_envs)
