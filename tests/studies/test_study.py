@@ -22,8 +22,8 @@ from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import AGENTS, make_agent
 from rl2grid.records.files import write_json
+from rl2grid.records.locks import is_locked
 from rl2grid.records.metrics import MetricsTail
-from rl2grid.studies import cell as study_cell
 from rl2grid.studies import run as study_run
 from rl2grid.studies.backends import Local, Slurm
 from rl2grid.studies.cell import BUSY, FAILED, FINISHED, REFUSED, CellResult, prepare
@@ -290,7 +290,7 @@ def test_an_interrupt_lets_the_cells_end_in_good_order(tmp_path: Path, monkeypat
     with pytest.raises(KeyboardInterrupt):
         run_study(study, Local(1, (sys.executable, "-c", WAITING_CELL)))
     assert (folder / "ended").exists()
-    assert not study_cell.is_busy(folder)
+    assert not is_locked(folder)
 
 
 STUDY_FILE = """

@@ -11,6 +11,7 @@ from rich.table import Table
 
 from rl2grid.cli.train import INTERRUPTED
 from rl2grid.errors import UsageError
+from rl2grid.records.logs import LOG_FILE
 
 if TYPE_CHECKING:
     from rl2grid.studies.cells import Study
@@ -88,7 +89,7 @@ def _run(options: argparse.Namespace) -> int:
     print(f"All episodes are in {study.output / 'episodes.csv'}.")
     failed = [state for state in states if state.state == State.FAILED]
     if failed:
-        print(f"{len(failed)} cells failed; their log.txt says why. The same command tries them again.")
+        print(f"{len(failed)} cells failed; their {LOG_FILE} says why. The same command tries them again.")
     return FAILED if failed else 0
 
 

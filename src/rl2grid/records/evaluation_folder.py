@@ -14,16 +14,16 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
+from filelock import BaseFileLock
 
 from rl2grid.errors import UsageError
 from rl2grid.records.episodes import EPISODES_FILE, Episode, format_row, read_episodes, write_episodes
 from rl2grid.records.evaluations import EVALUATION_FILE, read_request, write_evaluation
 from rl2grid.records.files import check_folder, make_folder
+from rl2grid.records.locks import LockedError, take_lock
 from rl2grid.records.summary import Summary, summarise
 
 PARTIAL_FILE = "episodes.partial.csv"
-LOCK_FILE = ".lock"
 
 
 class Store:
@@ -48,7 +48,7 @@ class FolderStore(Store):
     def __init__(self, folder: Path, request: Mapping[str, Any], command: str) -> None:
         self._folder, self._request, self._command = folder, request, command
         self._finished, self._partial = folder / EPISODES_FILE, folder / PARTIAL_FILE
-        self._lock: FileLock | None = None
+        self._lock: BaseFileLock | None = None
         if not folder.exists():
             check_folder(folder)
             return
@@ -107,10 +107,9 @@ class FolderStore(Store):
         write_evaluation(self._folder / EVALUATION_FILE, {**self._request, "command": self._command}, summary)
 
     def _take_lock(self) -> None:
-        self._lock = FileLock(self._folder / LOCK_FILE)
         try:
-            self._lock.acquire(timeout=0)
-        except Timeout:
+            self._lock = take_lock(self._folder)
+        except LockedError:
             raise UsageError(
                 f"Another process is writing to {self._folder}: wait for it, or choose another folder."
             ) from None

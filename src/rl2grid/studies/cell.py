@@ -5,7 +5,7 @@ A cell's folder holds
 - ``cell.json``: what is asked for;
 - ``run/``: the training run, if the agent learns, see :mod:`rl2grid.training.runs`;
 - ``evaluation/``: the episodes, see :mod:`rl2grid.evaluation.protocol`;
-- ``log.txt``: what its processes printed;
+- ``log.txt``: what its processes printed, see :mod:`rl2grid.records.logs`;
 - ``result.json``: written at the very end.
 
 ``python -m rl2grid.studies.cell <folder>`` does the work, on one thread. It stops with a checkpoint when it
@@ -24,11 +24,11 @@ import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from filelock import FileLock, Timeout
-
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.flags import evaluate_command
 from rl2grid.evaluation.protocol import evaluate
+from rl2grid.records.locks import LockedError, locked
+from rl2grid.records.logs import last_line, open_log
 from rl2grid.records.metrics import trained_seconds
 from rl2grid.records.studies import (
     CELL_FILE,
@@ -45,8 +45,6 @@ from rl2grid.studies.cells import Cell, Training, cell_from_dict, cell_to_dict
 from rl2grid.training import request, runs
 from rl2grid.training.commands import train_command
 from rl2grid.training.validation import validator
-
-LOG_FILE, LOCK_FILE = "log.txt", ".lock"
 
 FINISHED, FAILED, REFUSED, BUSY, STOPPED = 0, 1, 2, 75, 130
 """Exit statuses. ``REFUSED``: trying again is no use; ``BUSY``: another process has the cell; ``STOPPED``: asked to."""
@@ -73,17 +71,6 @@ def prepare(folder: Path, cell: Cell) -> None:
             )
 
 
-def is_busy(folder: Path) -> bool:
-    """Whether a process works on the cell now."""
-    if not (folder / LOCK_FILE).exists():
-        return False
-    try:
-        with FileLock(folder / LOCK_FILE).acquire(timeout=0):
-            return False
-    except Timeout:
-        return True
-
-
 def commands(folder: Path, cell: Cell) -> list[str]:
     """What to type to obtain the cell by hand."""
     keywords, lines, agent = {"heuristic": cell.heuristic, **cell.environment}, [], cell.agent
@@ -100,9 +87,9 @@ def run_cell(folder: Path) -> None:
     Raises:
         UsageError: what is asked for cannot be done.
         KeyboardInterrupt: a signal asked to stop; calling this again goes on.
-        filelock.Timeout: another process works on it.
+        LockedError: another process works on it.
     """
-    with FileLock(folder / LOCK_FILE).acquire(timeout=0):
+    with locked(folder):
         if read_result(folder) is None:
             _finish(folder)
 
@@ -168,7 +155,7 @@ class CellProcess:
 
     def __init__(self, folder: Path, command: Sequence[str] = COMMAND) -> None:
         """Start it; what it prints goes to the cell's log."""
-        with (folder / LOG_FILE).open("a", encoding="utf-8") as log:
+        with open_log(folder) as log:
             # A session of its own: Ctrl-C in a terminal reaches the study alone, which passes it on once.
             self._process = subprocess.Popen(
                 [*command, str(folder)],
@@ -211,7 +198,7 @@ def serve(do: Callable[[], None]) -> int:
         signal.signal(signal.SIGTERM, _interrupt)
         threading.Thread(target=_stop_when_input_ends, daemon=True).start()
         do()
-    except Timeout:
+    except LockedError:
         return BUSY
     except KeyboardInterrupt:
         return STOPPED
@@ -226,9 +213,7 @@ def serve(do: Callable[[], None]) -> int:
 
 def last_error(folder: Path) -> str:
     """The last line that the processes of a cell printed."""
-    path = folder / LOG_FILE
-    lines = path.read_text(encoding="utf-8", errors="replace").split("\n") if path.exists() else []
-    return next((line.strip() for line in reversed(lines) if line.strip()), "it left no message")
+    return last_line(folder) or "it left no message"
 
 
 def _interrupt(number: int, frame: object) -> None:

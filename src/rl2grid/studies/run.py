@@ -17,10 +17,11 @@ from typing import Any
 from rich.console import Console
 
 from rl2grid.records.files import make_folder
+from rl2grid.records.locks import is_locked
 from rl2grid.records.studies import read_result, write_study, write_study_episodes
 from rl2grid.records.versions import library_versions
 from rl2grid.studies.backends import Backend, Job
-from rl2grid.studies.cell import BUSY, FINISHED, REFUSED, STOPPED, commands, is_busy, last_error, prepare
+from rl2grid.studies.cell import BUSY, FINISHED, REFUSED, STOPPED, commands, last_error, prepare
 from rl2grid.studies.cells import Study
 from rl2grid.studies.progress import live_display, study_table
 from rl2grid.studies.states import CellState, State, look, read_states
@@ -101,7 +102,7 @@ class _Runner:
             show()
             for number, job in list(self._jobs.items()):
                 status = job.poll()
-                if status is not None and not is_busy(self.states[number].folder):
+                if status is not None and not is_locked(self.states[number].folder):
                     del self._jobs[number]
                     look(self.states[number])
             time.sleep(_POLL_SECONDS / 5)

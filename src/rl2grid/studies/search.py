@@ -1,11 +1,7 @@
 """Searching for hyperparameters: many short trainings, the poor ones ended early.
 
-A search is described by a TOML file (:mod:`rl2grid.studies.tuning`) and kept in its output folder::
-
-    tuning.json     what is searched
-    journal.log     Optuna's journal: every trial, shared by all processes of the search
-    trials/<hash>/  one run folder per configuration
-    best.json       the best configuration
+A search is described by a TOML file (:mod:`rl2grid.studies.tuning`) and kept in its output folder
+(:mod:`rl2grid.records.searches`).
 
 A process may be killed at any moment. The same command goes on: a trial that was under way is put back at the head of
 the queue and its run resumed. ``python -m rl2grid.studies.search <folder>`` works on trials until there are enough.
@@ -27,24 +23,32 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from filelock import FileLock, Timeout
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from rl2grid.algorithms.policy_agent import PolicyAgent
 from rl2grid.errors import UsageError
 from rl2grid.records.files import make_folder
+from rl2grid.records.locks import LockedError, is_locked
+from rl2grid.records.logs import LOG_FILE
 from rl2grid.records.metrics import read_validations
-from rl2grid.records.searches import read_search, write_best, write_search
-from rl2grid.studies.cell import STOPPED, CellProcess, is_busy, serve
+from rl2grid.records.searches import (
+    JOURNAL_FILE,
+    TRIALS_FOLDER,
+    beginning_lock,
+    read_search,
+    search_lock,
+    trial_lock,
+    write_best,
+    write_search,
+)
+from rl2grid.studies.cell import STOPPED, CellProcess, serve
 from rl2grid.studies.tuning import Tuning, kinds_of, run_args
 from rl2grid.training import request, runs
 from rl2grid.training.commands import train_command
 from rl2grid.training.interrupts import stop_requests
 from rl2grid.training.validation import score, validator
 
-JOURNAL_FILE = "journal.log"
-TRIALS_FOLDER = "trials"
 COMMAND: tuple[str, ...] = (sys.executable, "-m", "rl2grid.studies.search")
 
 
@@ -96,12 +100,12 @@ def run_tuning(
     statuses = [process.wait() for process in processes]
     best = _best(tuning)
     if best is None or all(status not in (0, STOPPED) for status in statuses):
-        raise UsageError(f"The search failed: {tuning.output / 'log.txt'} says why.")
+        raise UsageError(f"The search failed: {tuning.output / LOG_FILE} says why.")
     write_best(tuning.output, asdict(best) | {"command": best_command(tuning, best)})
     ended = len(_ended(_open(tuning)))
     if ended < tuning.trials:
         raise UsageError(
-            f"The search stopped after {ended} of {tuning.trials} trials: {tuning.output / 'log.txt'} says why, and "
+            f"The search stopped after {ended} of {tuning.trials} trials: {tuning.output / LOG_FILE} says why, and "
             "the same command goes on."
         )
     return best
@@ -120,12 +124,10 @@ def work(folder: Path) -> None:
     optuna = _optuna()
     tuning = Tuning(**(read_search(folder) or {}), output=folder)
     study = _open(tuning)
-    locks = folder / ".locks"
-    locks.mkdir(exist_ok=True)
     while (begun := _begin(tuning, study)) is not None:
         trial, chosen = begun
         # Of equal trials one trains; the others wait until it is told, and take what it reached.
-        with FileLock(locks / _trial_folder(tuning, chosen).name):
+        with trial_lock(folder, _trial_folder(tuning, chosen).name):
             try:
                 reached = _train(tuning, trial, chosen)
             except optuna.TrialPruned:
@@ -139,7 +141,7 @@ def _begin(tuning: Tuning, study: Any) -> tuple[Any, dict[str, Any]] | None:
     states = _optuna().trial.TrialState
     # All that are under way count, so that parallel processes do not begin more than asked for.
     counted = (states.COMPLETE, states.PRUNED, states.RUNNING)
-    with FileLock(tuning.output / ".begin.lock"):
+    with beginning_lock(tuning.output):
         number = sum(trial.state in counted for trial in study.get_trials(deepcopy=False))
         if number >= tuning.trials:
             return None
@@ -266,7 +268,7 @@ def _put_back_interrupted(tuning: Tuning) -> None:
     for trial in study.get_trials(deepcopy=False):
         if trial.state == state.RUNNING:
             # Its process may live a little longer than the one that started it, to write a checkpoint.
-            while is_busy(tuning.output / TRIALS_FOLDER / trial.user_attrs.get("run", "none")):
+            while is_locked(tuning.output / TRIALS_FOLDER / trial.user_attrs.get("run", "none")):
                 time.sleep(0.2)
             study.tell(trial.number, state=state.FAIL)
             if trial.params:
@@ -332,9 +334,9 @@ def _cores() -> int:
 @contextlib.contextmanager
 def _only_one(folder: Path) -> Iterator[None]:
     try:
-        with FileLock(folder / ".search.lock").acquire(timeout=0):
+        with search_lock(folder):
             yield
-    except Timeout:
+    except LockedError:
         raise UsageError(f"Another process searches in {folder}: wait for it, or choose another folder.") from None
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
 
+from rl2grid.records.locks import is_locked
 from rl2grid.records.metrics import METRICS_FILE, MetricsTail
 from rl2grid.records.studies import (
     EVALUATION_FOLDER,
@@ -15,7 +16,6 @@ from rl2grid.records.studies import (
     read_result,
     read_study,
 )
-from rl2grid.studies.cell import is_busy
 from rl2grid.studies.cells import Cell, Study
 
 _AGENT_WORK = 5_000
@@ -91,7 +91,7 @@ def look(state: CellState) -> None:
     state.tail.read()
     if state.result is not None:
         state.state = State.DONE
-    elif is_busy(state.folder):
+    elif is_locked(state.folder):
         state.state = State.RUNNING
     elif (state.folder / RUN_FOLDER).exists() or (state.folder / EVALUATION_FOLDER).exists():
         state.state = State.STOPPED

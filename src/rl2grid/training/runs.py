@@ -9,7 +9,7 @@ A run folder holds
 - ``best.pt``: the best policy on the validation scenarios so far, see :func:`rl2grid.training.validation.score`;
 - ``energy.json``: energy and CO2, see :mod:`rl2grid.training.energy`;
 - ``wandb.json``, ``wandb/``: of a tracked run, see :mod:`rl2grid.training.tracking`;
-- ``log.txt``: what happened when.
+- ``log.txt``: what happened when, see :mod:`rl2grid.records.logs`.
 
 A run that was interrupted and resumed any number of times ends with the same weights, bit for bit, and
 the same metrics as one that was not (times apart), on the same machine with the same library versions.
@@ -22,12 +22,10 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import asdict
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import gymnasium
-from filelock import FileLock, Timeout
 
 from rl2grid.algorithms.checkpoint import load_checkpoint, save_checkpoint
 from rl2grid.algorithms.metrics import MetricsWriter
@@ -36,6 +34,8 @@ from rl2grid.algorithms.registry import VectorEnvironment, find_algorithm
 from rl2grid.algorithms.trainer import Trainer
 from rl2grid.envs.registration import register_all
 from rl2grid.errors import UsageError
+from rl2grid.records import logs
+from rl2grid.records.locks import LockedError, take_lock
 from rl2grid.records.trainings import create_run_folder
 from rl2grid.training.energy import EnergyAccount
 from rl2grid.training.interrupts import stop_requests
@@ -53,8 +53,6 @@ from rl2grid.training.request import (
 from rl2grid.training.tracking import check_tracking, tracked
 from rl2grid.training.validation import Evaluate, score
 
-LOG_FILE = "log.txt"
-LOCK_FILE = ".lock"
 REPLAY_FOLDER = "replay"
 
 UNLIMITED = TimeLimit(None)
@@ -233,8 +231,7 @@ class _Run:
 
     def note(self, text: str) -> None:
         """Append a line to the log."""
-        with (self.folder / LOG_FILE).open("a", encoding="utf-8") as log:
-            log.write(f"{datetime.now(UTC).isoformat(timespec='seconds')} {text}\n")
+        logs.note(self.folder, text)
 
 
 def _run(run: _Run, envs: VectorEnvironment, limit: TimeLimit, checkpoint: Mapping[str, Any] | None) -> None:
@@ -303,10 +300,9 @@ def _budget(args: RunArgs, trainer: Trainer) -> int:
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
     """Keep other processes from writing into a run folder; the lock goes with this process, however it ends."""
-    lock = FileLock(folder / LOCK_FILE)
     try:
-        lock.acquire(timeout=0)
-    except Timeout as error:
+        lock = take_lock(folder)
+    except LockedError as error:
         raise UsageError(f"Folder {str(folder)!r} is being written by another process: wait until it ends.") from error
     try:
         yield
