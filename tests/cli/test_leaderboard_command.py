@@ -89,3 +89,33 @@ def test_refusals_are_one_sentence(folder, tmp_path, capsys, words, part):
     (sentence,) = captured.err.strip().splitlines()
     assert part in sentence
     assert "verified" not in captured.out
+
+
+@pytest.mark.parametrize("contents", [b"# A page\n", b"", b"{", b"\xff\xfe", b"{}", b"[]"])
+def test_a_file_that_is_something_else_is_refused_in_one_sentence(tmp_path, capsys, contents):
+    page = tmp_path / "README.md"
+    page.write_bytes(contents)
+    for words in (["verify", str(page)], ["table", str(page)]):
+        assert main(["leaderboard", *words]) == 2
+        assert capsys.readouterr().err == (
+            f"rl2grid: {page} is no entry of a leaderboard: give files that 'rl2grid leaderboard entry' wrote, or a "
+            "ledger of test results as --ledger.\n"
+        )
+    if contents == b"{}":  # an empty ledger
+        return
+    for words in (["table"], ["verify", "greedy@bus14-T0"], ["test", "greedy@bus14-T0"]):
+        assert main(["leaderboard", *words, "--ledger", str(page)]) == 2
+        assert capsys.readouterr().err == (
+            f"rl2grid: {page} is no ledger of test results: give a file that 'rl2grid leaderboard test' wrote, or one "
+            "that does not exist yet.\n"
+        )
+    assert page.read_bytes() == contents
+
+
+def test_a_file_is_no_run_whose_test_could_be_verified(tmp_path, capsys):
+    page = tmp_path / "README.md"
+    page.write_text("# A page")
+    assert main(["leaderboard", "verify", str(page), "--ledger", str(tmp_path / "ledger.json")]) == 2
+    assert capsys.readouterr().err == (
+        f"rl2grid: '{page}' holds no run: there is no config.json in it; give a folder that 'rl2grid train' wrote.\n"
+    )

@@ -111,10 +111,15 @@ def read_entry(path: Path) -> Entry:
     """
     try:
         contents = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise UsageError(f"{path} cannot be read as an entry of a leaderboard: {error}.") from None
+    except OSError as error:
+        raise UsageError(f"{path} cannot be read as an entry of a leaderboard: {error.strerror}.") from None
+    except ValueError:  # neither text nor JSON
+        contents = None
     if not isinstance(contents, dict) or contents.get("format") != FORMAT:
-        raise UsageError(f"{path} is no entry of a leaderboard: give files that 'rl2grid leaderboard entry' wrote.")
+        raise UsageError(
+            f"{path} is no entry of a leaderboard: give files that 'rl2grid leaderboard entry' wrote, or a ledger of "
+            "test results as --ledger."
+        )
     if contents.get("version") != VERSION:
         raise UsageError(
             f"{path} is an entry of version {contents.get('version')!r}: this rl2grid reads version {VERSION}."

@@ -76,8 +76,13 @@ def read_ledger(path: Path) -> dict[str, TestResult]:
     try:
         stored = json.loads(path.read_text(encoding="utf-8"))
         return {digest: TestResult(**result) for digest, result in stored.items()}
-    except (OSError, ValueError, TypeError, AttributeError) as error:
-        raise UsageError(f"{path} cannot be read as a ledger of test results: {error}.") from None
+    except OSError as error:
+        raise UsageError(f"{path} cannot be read as a ledger of test results: {error.strerror}.") from None
+    except (ValueError, TypeError, AttributeError):
+        raise UsageError(
+            f"{path} is no ledger of test results: give a file that 'rl2grid leaderboard test' wrote, or one that "
+            "does not exist yet."
+        ) from None
 
 
 def enter(path: Path, result: TestResult) -> None:

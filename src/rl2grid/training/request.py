@@ -181,8 +181,10 @@ def read_config(folder: Path) -> tuple[RunArgs, dict[str, Any]]:
         request["hyperparameters"] = algorithm.args(**_tuples(request["hyperparameters"]))
         request["env_keywords"] = _tuples(request["env_keywords"])
         return RunArgs(**request, folder=folder), config["identity"]
-    except FileNotFoundError as error:
-        raise UsageError(f"Folder {str(folder)!r} holds no run: there is no {RUN_FILE} in it.") from error
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise UsageError(
+            f"{str(folder)!r} holds no run: there is no {RUN_FILE} in it; give a folder that 'rl2grid train' wrote."
+        ) from error
     except (json.JSONDecodeError, KeyError, TypeError) as error:
         raise UsageError(
             f"File {str(folder / RUN_FILE)!r} does not describe a run of this version of rl2grid."
