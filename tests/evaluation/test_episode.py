@@ -10,7 +10,7 @@ import pytest
 
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.protocol import evaluate
-from rl2grid.records.entries import Entry, PlayedActions, episode_hash, facts_of, read_entry, write_entry
+from rl2grid.records.entries import PlayableEntry, PlayedActions, episode_hash, facts_of, read_entry, write_entry
 from rl2grid.records.episodes import read_episodes
 from rl2grid.records.evaluations import check_comparable
 from rl2grid.records.methods import group_methods
@@ -113,7 +113,7 @@ def test_an_entry_keeps_the_foresight_of_its_episodes(tmp_path):
     actions = [0] * min(DECISIONS, episode.decisions)
     actions += range(DECISIONS + 1, episode.decisions + 1)
     kept = PlayedActions(episode, np.array(actions, np.uint8))
-    write_entry(tmp_path / "entry.json", Entry("oracle", result.identity, result.command, None, (kept,)))
+    write_entry(tmp_path / "entry.json", PlayableEntry("oracle", result.identity, result.command, None, (kept,)))
     stored = read_entry(tmp_path / "entry.json")
     assert stored.evaluation.foresight
     assert stored.evaluation.episodes[0] == replace(episode, wall_time_s=0.0)

@@ -10,26 +10,26 @@ from sample_results import result
 
 from rl2grid.errors import UsageError
 from rl2grid.records.evaluations import identity_hash
-from rl2grid.records.ledger import enter, read_ledger, result_of
+from rl2grid.records.ledger import add_test, hashed_test, read_ledger
 
 LEDGER = Path(__file__).parents[2] / "benchmarks" / "results" / "baselines.json"
 CONFIGURATION = {"agent": "greedy", "task": "rl2grid/bus14-T0-v0", "heuristic": "idle"}
 
 
 def test_what_is_kept_of_an_evaluation():
-    kept = result_of(CONFIGURATION, {}, result("greedy", [[0.5], [1.0]]))
+    kept = hashed_test(CONFIGURATION, {}, result("greedy", [[0.5], [1.0]]))
     assert kept.test["episodes"] == 2
     assert kept.test["survival"][0] == 0.75
     assert (kept.agent, kept.heuristic) == ("greedy", "idle")
-    other = result_of(CONFIGURATION, {}, result("greedy", [[0.5], [0.9]]))
+    other = hashed_test(CONFIGURATION, {}, result("greedy", [[0.5], [0.9]]))
     assert other.episodes_hash != kept.episodes_hash
 
 
 def test_results_come_back_by_their_configuration(tmp_path: Path):
     path = tmp_path / "ledger.json"
     assert read_ledger(path) == {}
-    kept = result_of(CONFIGURATION, {}, result("greedy", [[0.5], [1.0]]))
-    enter(path, kept)
+    kept = hashed_test(CONFIGURATION, {}, result("greedy", [[0.5], [1.0]]))
+    add_test(path, kept)
     assert read_ledger(path) == {identity_hash(CONFIGURATION): kept}
 
 
@@ -41,7 +41,7 @@ def test_the_ledger_of_the_baselines_keeps_its_bytes(tmp_path: Path):
     for digest, kept in results.items():
         assert digest == identity_hash(kept.configuration)
     path.write_text(LEDGER.read_text())
-    enter(path, results[next(iter(results))])
+    add_test(path, results[next(iter(results))])
     assert path.read_bytes() == LEDGER.read_bytes()
 
 

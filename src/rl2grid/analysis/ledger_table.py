@@ -8,7 +8,7 @@ from typing import Any
 
 from rl2grid.envs.tasks import short_id
 from rl2grid.records.evaluations import identity_hash
-from rl2grid.records.ledger import TestResult
+from rl2grid.records.ledger import HashedTest
 
 _HEADINGS = (
     "task",
@@ -26,7 +26,7 @@ _HEADINGS = (
 _TESTED = {"completed": ".0%", "cost_tlo": ".0f", "safe_tlo": ".0%", "safe_lsi": ".0%"}
 
 
-def ledger_table(results: Iterable[TestResult]) -> str:
+def ledger_table(results: Iterable[HashedTest]) -> str:
     """Results as Markdown: tasks in order, trained agents last, the seeds of one configuration in one row."""
     lines = ["| " + " | ".join(_HEADINGS) + " |", "|" + "---|" * len(_HEADINGS)]
     for _, group in itertools.groupby(sorted(results, key=_place), key=lambda result: _place(result)[:-1]):
@@ -34,7 +34,7 @@ def ledger_table(results: Iterable[TestResult]) -> str:
     return "\n".join(lines)
 
 
-def _place(result: TestResult) -> tuple[Any, ...]:
+def _place(result: HashedTest) -> tuple[Any, ...]:
     """Where a result stands; those that differ in the last element alone are seeds of one configuration."""
     configuration = result.configuration
     others = dict(configuration.get("hyperparameters", {}))
@@ -44,7 +44,7 @@ def _place(result: TestResult) -> tuple[Any, ...]:
     return configuration["task"], trained, result.agent, str(result.heuristic), what, seed
 
 
-def _cells(group: Sequence[TestResult]) -> list[str]:
+def _cells(group: Sequence[HashedTest]) -> list[str]:
     first, training = group[0], [result.training for result in group]
     cells = [short_id(first.configuration["task"]), first.agent, first.heuristic or "none"]
     if first.training:
@@ -60,11 +60,11 @@ def _cells(group: Sequence[TestResult]) -> list[str]:
     return cells
 
 
-def _tested(group: Sequence[TestResult], name: str) -> list[float]:
+def _tested(group: Sequence[HashedTest], name: str) -> list[float]:
     return [result.test[name][0] for result in group]
 
 
-def _mean(group: Sequence[TestResult]) -> float:
+def _mean(group: Sequence[HashedTest]) -> float:
     return sum(_tested(group, "survival")) / len(group)
 
 

@@ -14,9 +14,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from rl2grid.analysis.table import result_table_rich
 from rl2grid.errors import UsageError
-from rl2grid.records.entries import Entry, read_entry, write_entry
+from rl2grid.records.entries import PlayableEntry, read_entry, write_entry
 from rl2grid.records.evaluations import check_comparable
-from rl2grid.records.ledger import enter, read_ledger
+from rl2grid.records.ledger import add_test, read_ledger
 from rl2grid.records.methods import Method
 from rl2grid.scenarios.splits import SPLITS
 
@@ -100,7 +100,7 @@ def _test(options: argparse.Namespace) -> int:
         if subject.digest in read_ledger(options.ledger):
             print(f"{subject.agent} on {subject.task.id} has had its test: see {options.ledger.name}.")
             continue
-        enter(options.ledger, play_test(subject))
+        add_test(options.ledger, play_test(subject))
     return 0
 
 
@@ -176,8 +176,8 @@ def _some(files: Sequence[Any]) -> Sequence[Any]:
     return files
 
 
-def _read(paths: Sequence[Path]) -> dict[Path, Entry]:
-    entries: dict[Path, Entry] = {}
+def _read(paths: Sequence[Path]) -> dict[Path, PlayableEntry]:
+    entries: dict[Path, PlayableEntry] = {}
     for path in paths:
         if path in entries:
             raise UsageError(f"{path} was given twice: leave one out.")

@@ -24,7 +24,7 @@ from rl2grid.ledger.replay import (
     scenarios_of,
 )
 from rl2grid.records.collection import find_evaluations
-from rl2grid.records.entries import Actions, Entry, PlayedActions, action_dtype
+from rl2grid.records.entries import Actions, PlayableEntry, PlayedActions, action_dtype
 from rl2grid.records.evaluations import Evaluation, is_evaluation, load_evaluation
 from rl2grid.records.studies import EVALUATION_FOLDER, RUN_FOLDER, read_cell
 from rl2grid.records.trainings import is_run, read_configuration, read_energy
@@ -52,7 +52,7 @@ def make_entry(
     agent: str | None = None,
     label: str | None = None,
     on_progress: OnProgress = lambda played: None,
-) -> Entry:
+) -> PlayableEntry:
     """Play the episodes of an evaluation again with its agent, and keep the actions.
 
     Args:
@@ -84,7 +84,7 @@ def make_entry(
                 )
             played.append(PlayedActions(again, _as_array(kept, task)))
     on_progress(len(played))
-    return Entry(
+    return PlayableEntry(
         label or result.episodes[0].agent,
         result.identity,
         result.command,

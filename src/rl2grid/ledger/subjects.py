@@ -11,7 +11,7 @@ from rl2grid.envs.tasks import Task, find_task, short_id
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.protocol import AS_TRAINED, evaluate
 from rl2grid.records.evaluations import identity_hash
-from rl2grid.records.ledger import TestResult, result_of
+from rl2grid.records.ledger import HashedTest, hashed_test
 from rl2grid.records.metrics import read_validations, trained_seconds
 from rl2grid.records.trainings import read_training_run
 
@@ -50,7 +50,7 @@ def find_subject(text: str) -> Subject:
     return _trained(Path(text))
 
 
-def play_test(subject: Subject) -> TestResult:
+def play_test(subject: Subject) -> HashedTest:
     """Play the test months; what the ledger keeps of it."""
     evaluation = evaluate(
         subject.agent,
@@ -60,7 +60,7 @@ def play_test(subject: Subject) -> TestResult:
         workers=0,
         progress=True,
     )
-    return result_of(subject.configuration, subject.training, evaluation)
+    return hashed_test(subject.configuration, subject.training, evaluation)
 
 
 def _untrained(agent: str, task: Task, heuristic: str | None) -> Subject:

@@ -25,12 +25,12 @@ from rl2grid.ledger.replay import (
     scenarios_of,
 )
 from rl2grid.ledger.subjects import Subject, play_test
-from rl2grid.records.entries import Actions, Entry, PlayedActions
-from rl2grid.records.ledger import TestResult
+from rl2grid.records.entries import Actions, PlayableEntry, PlayedActions
+from rl2grid.records.ledger import HashedTest
 from rl2grid.scenarios.library import check_in_split
 
 
-def check_entry(entry: Entry, name: str) -> None:
+def check_entry(entry: PlayableEntry, name: str) -> None:
     """Refuse an entry that cannot be played here, or that is about other data or actions.
 
     Args:
@@ -54,7 +54,7 @@ def check_entry(entry: Entry, name: str) -> None:
             raise UsageError(f"{name} was changed: episode {episode.name} begins at another row.")
 
 
-def verify_entry(entry: Entry, on_progress: OnProgress = lambda played: None) -> str | None:
+def verify_entry(entry: PlayableEntry, on_progress: OnProgress = lambda played: None) -> str | None:
     """Play the stored actions again.
 
     Args:
@@ -81,7 +81,7 @@ def verify_entry(entry: Entry, on_progress: OnProgress = lambda played: None) ->
     return None
 
 
-def verify_test(stored: TestResult, subject: Subject) -> str | None:
+def verify_test(stored: HashedTest, subject: Subject) -> str | None:
     """Play the test months again with the agent.
 
     Args:

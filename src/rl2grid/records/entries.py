@@ -50,8 +50,14 @@ class PlayedActions:
 
 
 @dataclass(frozen=True, eq=False)
-class Entry:
-    """An evaluation that can be played again without its agent."""
+class PlayableEntry:
+    """An evaluation with all its actions, which can be played again without its agent.
+
+    A :class:`rl2grid.records.ledger.HashedTest` is another thing, and neither can be made of the other. An entry proves
+    itself to those who have nothing else, and is as large as its actions are many; what its agent was is what the
+    sender says. A hashed test is that of a frozen configuration, small enough for hundreds to stand in one file, and
+    proves nothing without the agent.
+    """
 
     label: str
     """What tables call the agent."""
@@ -88,7 +94,7 @@ def episode_hash(facts: Mapping[str, Any], foresight: int = 0) -> str:
     return hashlib.sha256(json.dumps(values).encode()).hexdigest()[:16]
 
 
-def write_entry(path: Path, entry: Entry) -> None:
+def write_entry(path: Path, entry: PlayableEntry) -> None:
     """Write an entry, whole or not at all."""
     contents = {
         "format": FORMAT,
@@ -103,7 +109,7 @@ def write_entry(path: Path, entry: Entry) -> None:
     write_json(path, contents, indent=1)
 
 
-def read_entry(path: Path) -> Entry:
+def read_entry(path: Path) -> PlayableEntry:
     """Read an entry and check that it agrees with itself.
 
     Raises:
@@ -137,7 +143,7 @@ def action_dtype(n_actions: int) -> np.dtype[Any]:
     return np.min_scalar_type(n_actions - 1).newbyteorder("<")
 
 
-def _parse(path: Path, contents: Mapping[str, Any]) -> Entry:
+def _parse(path: Path, contents: Mapping[str, Any]) -> PlayableEntry:
     identity = dict(contents["identity"])
     if identity_hash(identity) != contents["identity_hash"]:
         raise UsageError(f"{path} was changed: its identity does not have the hash {contents['identity_hash']!r}.")
@@ -149,7 +155,7 @@ def _parse(path: Path, contents: Mapping[str, Any]) -> Entry:
     keys = {(one.episode.scenario, one.episode.seed, one.episode.start) for one in episodes}
     if len(keys) != len(episodes):
         raise UsageError(f"{path} was changed: it has an episode twice.")
-    entry = Entry(str(contents["label"]), identity, str(contents["command"]), contents["training"], episodes)
+    entry = PlayableEntry(str(contents["label"]), identity, str(contents["command"]), contents["training"], episodes)
     _ = entry.evaluation.summary  # refuses what is no table of scenarios and seeds
     return entry
 

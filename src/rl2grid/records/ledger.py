@@ -22,10 +22,11 @@ _FIGURES = ("survival", "completed", "cost_lsi", "cost_tlo", "safe_lsi", "safe_t
 
 
 @dataclass(frozen=True)
-class TestResult:
-    """A frozen configuration and what its test gave."""
+class HashedTest:
+    """A frozen configuration and what its test gave, with hashes in place of the episodes.
 
-    __test__ = False  # no class of tests
+    No :class:`rl2grid.records.entries.PlayableEntry`, which says why.
+    """
 
     configuration: Mapping[str, Any]
     """Task, algorithm, hyperparameters and keywords of the environment, or agent, task and heuristic."""
@@ -51,12 +52,12 @@ class TestResult:
         return str(self.configuration.get("algorithm") or self.configuration["agent"])
 
 
-def result_of(configuration: Mapping[str, Any], training: Mapping[str, Any], evaluation: Evaluation) -> TestResult:
+def hashed_test(configuration: Mapping[str, Any], training: Mapping[str, Any], evaluation: Evaluation) -> HashedTest:
     """What the ledger keeps of an evaluation."""
     rows = [[row.scenario, row.seed, row.grid_steps, row.decisions, row.episode_return] for row in evaluation.episodes]
     summary = evaluation.summary
     figures = {name: _interval(getattr(summary, name)) for name in _FIGURES}
-    return TestResult(
+    return HashedTest(
         configuration=dict(configuration),
         training=dict(training),
         identity_hash=identity_hash(evaluation.identity),
@@ -65,7 +66,7 @@ def result_of(configuration: Mapping[str, Any], training: Mapping[str, Any], eva
     )
 
 
-def read_ledger(path: Path) -> dict[str, TestResult]:
+def read_ledger(path: Path) -> dict[str, HashedTest]:
     """Results by the hash of their configuration, in the order in which they were entered; none without a file.
 
     Raises:
@@ -75,7 +76,7 @@ def read_ledger(path: Path) -> dict[str, TestResult]:
         return {}
     try:
         stored = json.loads(path.read_text(encoding="utf-8"))
-        return {digest: TestResult(**result) for digest, result in stored.items()}
+        return {digest: HashedTest(**result) for digest, result in stored.items()}
     except OSError as error:
         raise UsageError(f"{path} cannot be read as a ledger of test results: {error.strerror}.") from None
     except (ValueError, TypeError, AttributeError):
@@ -85,7 +86,7 @@ def read_ledger(path: Path) -> dict[str, TestResult]:
         ) from None
 
 
-def enter(path: Path, result: TestResult) -> None:
+def add_test(path: Path, result: HashedTest) -> None:
     """Add a result to a ledger, or replace that of its configuration."""
     results = {**read_ledger(path), identity_hash(result.configuration): result}
     write_json(path, {digest: asdict(one) for digest, one in results.items()}, indent=1)
