@@ -29,11 +29,14 @@ ROOT = Path(__file__).resolve().parents[1]
 FAULTS = Path(__file__).resolve().parent / "faults.toml"
 RESULTS = Path(__file__).resolve().parent / "results" / "faults.json"
 TESTS = {
-    "engine": ("engines/test_native_parity.py", "engines/test_joint_actions.py", "mdp", "engines", "powerflow", "envs"),
-    "algorithms": ("algorithms", "training"),
-    "records": ("records", "evaluation", "ledger", "studies", "analysis", "cli"),
+    "engine": (
+        ("engines/test_native_parity.py", "engines/test_joint_actions.py"),
+        ("mdp", "engines", "powerflow", "envs"),
+    ),
+    "algorithms": (("algorithms", "training"),),
+    "records": (("records", "evaluation", "ledger", "studies", "analysis", "cli"),),
 }
-"""Tests that are run for a fault of each part of the code, in this order: first those that play most of it."""
+"""Tests that are run for a fault of each part of the code, one group after the other: first those that play most."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +86,6 @@ class Copy:
 
     def first_failure(self, part: str, tests: Path) -> str | None:
         """The first of the tests for a part of the code that fails, None if all pass."""
-        folders = [str(tests / folder) for folder in TESTS[part] if (tests / folder).exists()]
         # Compiled code of a faulty version is of no use to anyone; the months are those of all versions.
         environment = os.environ | {
             "PYTHONPATH": f"{self._source}:{tests}",
@@ -92,12 +94,19 @@ class Copy:
             "RL2GRID_DATA": str(data_folder()),
             "OPENBLAS_NUM_THREADS": "1",
         }
-        command = [sys.executable, "-m", "pytest", "-m", "not slow", "-x", "-q", "-p", "no:cacheprovider", *folders]
-        finished = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
-        if finished.returncode == 0:
-            return None
-        failed = [line.split(" ")[1] for line in finished.stdout.splitlines() if line.startswith(("FAILED ", "ERROR "))]
-        return failed[0].removeprefix("tests/") if failed else f"exit status {finished.returncode}"
+        for group in TESTS[part]:
+            paths = [str(tests / name) for name in group if (tests / name).exists()]
+            command = [sys.executable, "-m", "pytest", "-m", "not slow", "-x", "-q", "-p", "no:cacheprovider", *paths]
+            finished = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+            if finished.returncode != 0:
+                return _first_failed(finished)
+        return None
+
+
+def _first_failed(finished: subprocess.CompletedProcess[str]) -> str:
+    """The test that a run of pytest stopped at."""
+    failed = [line.split(" ")[1] for line in finished.stdout.splitlines() if line.startswith(("FAILED ", "ERROR "))]
+    return failed[0].removeprefix("tests/") if failed else f"exit status {finished.returncode}"
 
 
 def main() -> None:
