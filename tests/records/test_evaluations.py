@@ -120,6 +120,9 @@ def test_only_comparable_results_share_a_table():
         check_comparable([first, result("b", [[0.5]], versions={"rl2grid": "1"})])
     with pytest.raises(UsageError, match="different scenarios or seeds"):
         check_comparable([first, result("b", [[0.5, 0.6]])])
+    other_month = replace(first, episodes=(replace(first.episodes[0], scenario="another month"),))
+    with pytest.raises(UsageError, match="different scenarios or seeds"):
+        check_comparable([first, other_month])
     with pytest.raises(UsageError, match="at least one"):
         check_comparable([])
 

@@ -1,14 +1,32 @@
-"""Folders to write to: made, or refused in one sentence."""
+"""Files are written whole or not at all; folders to write to are made, or refused in one sentence."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from rl2grid.errors import UsageError
-from rl2grid.records.files import check_folder, make_folder
+from rl2grid.records.files import check_folder, make_folder, write_json, write_text
+
+
+def test_a_file_that_cannot_be_written_whole_stays_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    write_json(tmp_path / "file", {"a": 1})
+    before = (tmp_path / "file").read_bytes()
+    assert before == b'{\n  "a": 1\n}\n'
+    with pytest.raises(UnicodeEncodeError):
+        write_text(tmp_path / "file", 1000 * "words" + "\ud800")
+    assert (tmp_path / "file").read_bytes() == before
+
+    def killed(*arguments: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "replace", killed)
+    with pytest.raises(KeyboardInterrupt):
+        write_text(tmp_path / "file", "half a file")
+    assert (tmp_path / "file").read_bytes() == before
 
 
 def test_a_folder_is_made_with_those_above_it_and_may_exist(tmp_path: Path):
