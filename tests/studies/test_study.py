@@ -23,7 +23,6 @@ from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import AGENTS, make_agent
 from rl2grid.records.files import write_json
 from rl2grid.records.locks import is_locked
-from rl2grid.records.metrics import MetricsTail
 from rl2grid.studies import run as study_run
 from rl2grid.studies.backends import Local, Slurm
 from rl2grid.studies.cell import BUSY, FAILED, FINISHED, REFUSED, CellResult, prepare
@@ -162,36 +161,6 @@ def test_a_cell_survives_its_file(tmp_path: Path):
     (other,) = parse_study(contents(group=group, budget=2048)).cells
     with pytest.raises(UsageError, match="another training"):
         prepare(tmp_path, other)
-
-
-def test_metrics_are_followed_while_they_grow_and_after_a_cut(tmp_path: Path):
-    path = tmp_path / "metrics.csv"
-    tail = MetricsTail(path)
-    tail.read()
-    head = "step,grid_steps,wall_time,name,value\n"
-    path.write_text(head + "10,1,0.1,validation/survival,0.25\n20,2,0.2,charts/SPS,5\n30,3,0.3,valid")
-    tail.read()
-    assert (tail.decisions, tail.best) == (20, 0.25)
-    path.write_text(head + "10,1,0.1,validation/survival,0.25\n")
-    tail.read()
-    assert (tail.decisions, tail.best) == (10, 0.25)
-    path.write_text("")
-    tail.read()
-    assert (tail.decisions, tail.best) == (0, None)
-    path.write_text(head)
-    tail.read()
-    assert (tail.decisions, tail.best) == (0, None)
-
-
-def test_metrics_that_were_cut_and_grew_past_what_was_read_are_read_again(tmp_path: Path):
-    path = tmp_path / "metrics.csv"
-    tail = MetricsTail(path)
-    head = "step,grid_steps,wall_time,name,value\n10,1,0.1,validation/survival,0.25\n"
-    path.write_text(head + "20,2,0.2,validation/survival,0.75\n")
-    tail.read()
-    path.write_text(head + "20,2,0.2000,validation/survival,0.5\n30,3,0.3,torn\n30,3,0.3,charts/SPS,5\n")
-    tail.read()
-    assert (tail.decisions, tail.best) == (30, 0.5)
 
 
 class FakeBackend:
