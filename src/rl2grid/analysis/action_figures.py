@@ -31,7 +31,8 @@ from rl2grid.drawing.grid_drawing import GridDrawing, add_legend, reference_scen
 from rl2grid.drawing.theme import LIGHT, Theme, style
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
-from rl2grid.grids.rankings import Trials, ranking, trials
+from rl2grid.grids.ranking import Trials
+from rl2grid.grids.rankings import ranking, trials
 from rl2grid.mdp.actions import ActionKind, StepAction, describe
 
 MAX_POINTS = 600

@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from rl2grid.arrays import F64
 from rl2grid.errors import UsageError
 from rl2grid.grids import STEPS_PER_HOUR, Grid, find_system
-from rl2grid.grids.rankings import Trials, ranking, trials
+from rl2grid.grids.ranking import Trials
+from rl2grid.grids.rankings import ranking, trials
 from rl2grid.mdp.actions import (
     WORD_BITS,
     ActionKind,

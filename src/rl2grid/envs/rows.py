@@ -2,12 +2,12 @@
 
 :class:`~rl2grid.envs.native_rows.NativeRows` plays them in compiled code, all in one call,
 :class:`~rl2grid.envs.local_rows.LocalRows` one after the other on the reference engine in this process, and
-:class:`~rl2grid.envs.remote_rows.RemoteRows` on the reference engine in other processes. :func:`make_rows` chooses.
+:class:`~rl2grid.envs.remote_rows.RemoteRows` on the reference engine in other processes.
+:func:`~rl2grid.envs.making_rows.make_rows` chooses.
 """
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -15,9 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rl2grid.engines.worlds import World
-from rl2grid.envs.options import TaskOptions
-from rl2grid.envs.tasks import Task
-from rl2grid.errors import UsageError
 
 
 @dataclass
@@ -99,40 +96,3 @@ class Rows(Protocol):
 
     def close(self) -> None:
         """Free the simulators and end the processes."""
-
-
-def make_rows(
-    task: Task, options: TaskOptions, n: int, *, num_threads: int | None = None, num_workers: int | None = None
-) -> Rows:
-    """``n`` rows of ``task`` on the engine of ``options``.
-
-    Args:
-        task: the task.
-        options: the keywords that the environments are made with.
-        n: number of rows.
-        num_threads: native engine: threads that share the rows; None takes one per processor core.
-        num_workers: reference engine: processes that share them; 0 plays in this one; None takes one per core.
-
-    Raises:
-        UsageError: threads for the reference engine, or processes for the native one.
-    """
-    # Each engine is imported where it is used: it loads much that the other does not need.
-    if options.engine == "native":
-        _refuse("num_workers", num_workers, "num_threads", options.engine)
-        from rl2grid.envs.native_rows import NativeRows
-
-        return NativeRows(task, options, n, num_threads)
-    _refuse("num_threads", num_threads, "num_workers", options.engine)
-    workers = min(n, os.cpu_count() or 1) if num_workers is None else min(n, num_workers)
-    if workers == 0:
-        from rl2grid.envs.local_rows import LocalRows
-
-        return LocalRows(task, options, n)
-    from rl2grid.envs.remote_rows import RemoteRows
-
-    return RemoteRows(task, options, n, workers)
-
-
-def _refuse(keyword: str, value: int | None, instead: str, engine: str) -> None:
-    if value is not None:
-        raise UsageError(f"{keyword}={value!r} is not for engine={engine!r}: give {instead}.")

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from rl2grid.engines.worlds import World
 from rl2grid.envs.description import TaskDescription, single_spaces
+from rl2grid.envs.making_rows import make_rows
 from rl2grid.envs.options import keyword_names, options_of, shows_options
-from rl2grid.envs.rows import Batch, make_rows
+from rl2grid.envs.rows import Batch
 from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
 

@@ -13,49 +13,16 @@ from __future__ import annotations
 import hashlib
 import json
 import zipfile
-from dataclasses import dataclass
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rl2grid.errors import UsageError
+from rl2grid.grids.ranking import Ranking, Trials
 from rl2grid.grids.systems import find_system, load_grid
-
-
-@dataclass(frozen=True, eq=False)
-class Ranking:
-    """The ranked actions of one grid, best first, and what came of trying them."""
-
-    ids: NDArray[np.int32]
-    """Catalogue ids, without do nothing; read-only."""
-    metadata: dict[str, Any]
-    """How the ranking was made: version, command, seed, number of states, method."""
-    hash: str
-    """Short hash of the grid and of the ids in order."""
-    trials: Trials | None
-    """None: the ranking does not tell how often each action was tried."""
-
-
-@dataclass(frozen=True, eq=False)
-class Trials:
-    """What came of trying the actions of one grid, by catalogue id; read-only."""
-
-    trials: NDArray[np.uint32]
-    """[action] how often the action was tried."""
-    survived: NDArray[np.uint32]
-    """[action] trials without a collapse of the grid, or a line above the hard limit of its protection."""
-    margin: NDArray[np.float32]
-    """[action] mean over the trials that survived of 1 - the worst loading that resulted, in [-1, 1]."""
-
-    @property
-    def survival(self) -> NDArray[np.float64]:
-        """[action] share of the trials that survived; NaN for an action that was never tried."""
-        tried = self.trials > 0
-        return np.where(tried, self.survived / np.maximum(self.trials, 1), np.nan)
 
 
 def ranking(grid_id: str) -> Ranking:

@@ -12,16 +12,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 from numpy.typing import NDArray
 
 from rl2grid.errors import UsageError, one_of
 from rl2grid.grids.grid import Grid, MaintenanceConfig
 from rl2grid.grids.network import Network
-
-if TYPE_CHECKING:
-    from rl2grid.grids.rankings import Ranking
+from rl2grid.grids.ranking import Ranking
 
 T = TypeVar("T")
 
