@@ -105,7 +105,8 @@ class Copy:
 
 def _first_failed(finished: subprocess.CompletedProcess[str]) -> str:
     """The test that a run of pytest stopped at."""
-    failed = [line.split(" ")[1] for line in finished.stdout.splitlines() if line.startswith(("FAILED ", "ERROR "))]
+    lines = [line for line in finished.stdout.splitlines() if line.startswith(("FAILED ", "ERROR "))]
+    failed = [line.split(" ", 1)[1].split(" - ")[0] for line in lines]
     return failed[0].removeprefix("tests/") if failed else f"exit status {finished.returncode}"
 
 
