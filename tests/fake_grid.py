@@ -100,6 +100,7 @@ class FakeGrid(gymnasium.Env[Any, Any]):
         self._steps = 0
         self._announce()
         self._heuristic()
+        self._reset_steps, self._steps = self._steps, 0
         self._over = self._ended()
         return self._observation(), self._info()
 
@@ -109,17 +110,13 @@ class FakeGrid(gymnasium.Env[Any, Any]):
         else:
             assert not self._ended(), "an ended episode was stepped"
             assert self.action_masks()[int(action)], "an illegal action was played"
-            if self._asked:
-                self._steps = 0
-            self._asked = True
+            self._steps = 0
             self._stress = max(0.0, self._stress - (0.25 if action == 1 else 0.0))
             self._advance()
             self._heuristic()
         return self._observation(), float(self._steps) * 0.75, self._lost(), self._completed(), self._info()
 
     def _heuristic(self) -> None:
-        if self._step == 0:
-            self._asked = False
         while self.options.heuristic and not self._ended() and (self._stress < 0.4 or "doomed" in self._scenario):
             self._advance()
 
@@ -150,7 +147,8 @@ class FakeGrid(gymnasium.Env[Any, Any]):
         return np.array([self._step / LENGTH, self._stress], np.float32)
 
     def _info(self) -> dict[str, Any]:
-        steps = self._steps
+        steps, before = self._steps, self._reset_steps
+        lost = 2.0 * self._lost()
         return {
             "scenario": self._scenario,
             "start": self._start,
@@ -160,7 +158,10 @@ class FakeGrid(gymnasium.Env[Any, Any]):
             "survival": (self._step - self._lost()) / LENGTH,
             "n_steps": steps,
             "reward_components": {"survive": 1.0 * steps, "overload": 0.0, "cost": -0.25 * steps},
-            "costs": {"LSI": 2.0 * self._lost(), "TLO": 0.5 * steps},
+            "costs": {"LSI": lost * (steps > 0), "TLO": 0.5 * steps},
+            "reset_reward": 0.75 * before,
+            "reset_components": {"survive": 1.0 * before, "overload": 0.0, "cost": -0.25 * before},
+            "reset_costs": {"LSI": lost * (steps == 0), "TLO": 0.5 * before},
             "scores": {"margin": 1.5, "overload": -0.5, "topology": -2.0},
             "illegal": False,
             "ambiguous": steps > 30,

@@ -105,7 +105,9 @@ def test_transition_adds_up_its_grid_steps(plain, idle):
     options = {"scenario": month(), "start": 0}
     plain.reset(seed=0, options=options)
     _, info = idle.reset(seed=0, options=options)
-    assert info["n_steps"] > 100
+    assert info["reset_steps"] == info["step"] > 100
+    assert info["n_steps"] == info["discounted_reward"] == info["cost"] == 0
+    assert not any(info["reward_components"].values())
     rewards, costs, components = [], [], []
     while plain.unwrapped.state.step[0] < info["step"]:
         observation, reward, terminated, truncated, single = plain.step(0)
@@ -115,9 +117,16 @@ def test_transition_adds_up_its_grid_steps(plain, idle):
         assert single["n_steps"] == 1
         assert not terminated
         assert not truncated
-    # One more step by the agent: what accrued inside reset belongs to this first transition.
+    # What accrued inside reset is in no transition.
     action = 7
     idle_observation, idle_reward, _, _, idle_info = idle.step(action)
+    for name in ("reset_steps", "reset_reward", "reset_components", "reset_costs"):
+        assert idle_info[name] == info[name]
+    earned = sum(rewards)
+    assert info["reset_reward"] == info["episode_return"] == pytest.approx(earned, rel=1e-12)
+    assert info["reset_costs"]["TLO"] == sum(costs)
+    assert info["reset_components"]["overload"] == pytest.approx(sum(components), rel=1e-12)
+    rewards, costs, components = [], [], []
     observation, reward, _, _, single = plain.step(action)
     rewards.append(reward)
     costs.append(single["costs"]["TLO"])
@@ -133,7 +142,7 @@ def test_transition_adds_up_its_grid_steps(plain, idle):
     assert idle_info["reward_components"]["overload"] == pytest.approx(sum(components), rel=1e-12)
     discounted = sum(0.9**k * reward for k, reward in enumerate(rewards))
     assert idle_info["discounted_reward"] == pytest.approx(discounted, rel=1e-12)
-    assert idle_info["episode_return"] == pytest.approx(sum(rewards), rel=1e-12)
+    assert idle_info["episode_return"] == pytest.approx(earned + sum(rewards), rel=1e-12)
 
 
 def test_idle_never_hands_over_a_safe_grid(idle):
@@ -151,12 +160,13 @@ def test_episode_that_ends_inside_reset_is_returned_by_the_first_step(engine):
         observation, info = environment.reset(seed=0, options={"scenario": scenario, "start": 0})
         if not info["over"]:
             pytest.fail("the two-day scenario was expected to be safe from its first to its last step")
-        n_steps = info["n_steps"]
+        reset_reward = info["reset_reward"]
+        assert info["reset_steps"] == info["step"] == info["episode_length"]
         after, reward, terminated, truncated, info = environment.step(3)
         assert (terminated, truncated) == (False, True)
         assert info["survival"] == 1.0
-        assert info["n_steps"] == n_steps
-        assert reward == pytest.approx(info["episode_return"])
+        assert info["n_steps"] == reward == 0
+        assert info["reset_reward"] == info["episode_return"] == reset_reward > 0
         assert not info["over"]
         np.testing.assert_array_equal(observation, after)
         with pytest.raises(UsageError, match="call reset"):

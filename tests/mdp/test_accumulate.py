@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rl2grid.grids import load_grid
-from rl2grid.mdp.accumulate import accrue, begin_episode, begin_transition
+from rl2grid.mdp.accumulate import accrue, begin_episode, begin_transition, end_reset
 from rl2grid.mdp.constraints import lsi_cost, tlo_cost
 from rl2grid.mdp.scores import margin_score, overload_score, topology_score
 from rl2grid.mdp.termination import GameOver
@@ -109,12 +109,26 @@ def test_rows_are_independent(random_rows):
         assert random_rows.episode_costs[i].tolist() == expected
 
 
-def test_sums_of_transitions_are_the_sums_of_the_episode(state):
+def test_what_a_reset_played_is_put_aside(state):
+    play(state, [(1.0, 0.0, 0.0)] * 3)
+    expected = {name: getattr(state, f"transition_{name}")[0].copy() for name in ("reward", "components", "costs")}
+    end_reset(state, 0)
+    assert state.reset_steps[0] == 3
+    for name, value in expected.items():
+        np.testing.assert_array_equal(getattr(state, f"reset_{name}")[0], value)
+    for name in TRANSITION_SUMS:
+        assert not getattr(state, name)[0].any(), name
+    assert state.transition_discount[0] == 1
+    assert state.episode_return[0] == 3
+
+
+def test_sums_of_the_reset_and_of_transitions_are_the_sums_of_the_episode(state):
     rng = np.random.default_rng(0)
-    totals = np.zeros(6)
+    play(state, [(1.0, -0.5, 0.25)] * 2)
+    end_reset(state, 0)
+    totals = np.array([state.reset_reward[0], *state.reset_components[0], *state.reset_costs[0]])
     for n_steps in (5, 1, 3):
-        if state.decisions[0] > 0:
-            begin_transition(state, 0)
+        begin_transition(state, 0)
         state.decisions[0] += 1
         for _ in range(n_steps):
             state.line_status[0] = rng.random(59) < 0.9

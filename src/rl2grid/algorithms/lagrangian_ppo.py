@@ -239,7 +239,7 @@ class LagrangianPPO(ppo.PPO):
         self.cost_scale = 1.0 - self.cost_gamma if args.cost_scale is None else args.cost_scale
         initial = np.full(len(self.constraints), args.initial_multiplier, np.float64)
         self.multipliers = Multipliers(initial, initial)
-        self.account = CostAccount(args.num_envs, self.thresholds)
+        self.account = CostAccount(args.num_envs, tuple(limits), self.thresholds)
 
     def before_update(self) -> dict[str, float]:
         """Let the multipliers follow the episodes that ended in the rollout."""
@@ -270,7 +270,13 @@ class LagrangianPPO(ppo.PPO):
         following = values_that_follow(
             rollout.cost_values, last_values, rollout.next_cost_values, rollout.ended.unsqueeze(-1)
         )
-        return replace(rollout, next_cost_values=following), {**metrics, **self.account.metrics(self.constraints)}
+        return replace(rollout, next_cost_values=following), {**metrics, **self.account.metrics()}
+
+    def begin_episodes(self, infos: Mapping[str, Any], begun: NDArray[np.bool_]) -> None:
+        """See :class:`Trainer`."""
+        super().begin_episodes(infos, begun)
+        if self.observations is None:  # later episodes begin when the costs of those before have been counted
+            self.account.begin(infos, begun)
 
     def _play(self, tally: Tally) -> tuple[Rollout, Played]:
         """One decision in every environment: a step of a rollout, with what it cost."""
@@ -338,10 +344,10 @@ class LagrangianPPO(ppo.PPO):
 class CostAccount:
     """The costs of episodes, not scaled: of those that are played, and of those that ended in a rollout."""
 
-    def __init__(self, num_envs: int, thresholds: NDArray[np.float64]) -> None:
+    def __init__(self, num_envs: int, constraints: tuple[str, ...], thresholds: NDArray[np.float64]) -> None:
         self.running = np.zeros((num_envs, len(thresholds)), np.float64)
         """[num_envs, constraint], so far"""
-        self._thresholds = thresholds
+        self._constraints, self._thresholds = constraints, thresholds
         self.forget()
 
     def forget(self) -> None:
@@ -355,18 +361,25 @@ class CostAccount:
         self._ended.extend(self.running[played.ended].copy())
         safe = played.completed & (self.running <= self._thresholds).all(axis=1)
         self._safe.extend(safe[played.ended].tolist())
-        self.running[played.ended] = 0.0
+        self.begin(played.infos, played.ended)
+
+    def begin(self, infos: Mapping[str, Any], begun: NDArray[np.bool_]) -> None:
+        """Episodes begin with what their resets have cost: no decision led to it, but the constraint counts it."""
+        nothing = np.zeros(len(begun), np.float64)
+        costs = infos.get("reset_costs", {})
+        for column, name in enumerate(self._constraints):
+            self.running[begun, column] = reported(costs, name, nothing)[begun]
 
     @property
     def costs(self) -> NDArray[np.float64]:
         """Of the episodes that ended, [episode, constraint]."""
         return np.array(self._ended, np.float64).reshape(-1, len(self._thresholds))
 
-    def metrics(self, constraints: tuple[str, ...]) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         """Means over the episodes that ended; nothing if none did."""
         if not self._ended:
             return {}
-        names = _metric_names("charts/episodic_cost", constraints)
+        names = _metric_names("charts/episodic_cost", self._constraints)
         means = dict(zip(names, self.costs.mean(axis=0).tolist(), strict=True))
         return {**means, "charts/safe_episodes": float(np.mean(self._safe))}
 

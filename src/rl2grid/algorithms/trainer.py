@@ -1,8 +1,9 @@
 """What all trainers have in common: a step of every environment and the account of it, budget, checkpoints.
 
 Transitions of varying length
-    Between two decisions the grid makes n_k >= 1 steps (heuristics, or a reset, play the others): a
-    semi-Markov decision process. With the discount gamma of one grid step, transition k is worth
+    Between two decisions the grid makes n_k >= 1 steps (a heuristic plays the others): a semi-Markov decision
+    process. What a reset plays before the first decision is in no transition. With the discount gamma of one grid
+    step, transition k is worth
 
         R_k = sum over j < n_k of gamma^j r_{k,j}                  info["discounted_reward"]
 
@@ -174,7 +175,9 @@ class Trainer(ABC):
         """Begin the first episodes; what they show."""
         observations: NDArray[np.float32]
         observations, infos = self.envs.reset(seed=self.args.seed * self.args.num_envs)
-        self._over = reported(infos, "over", np.zeros(self.args.num_envs, np.bool_))
+        everywhere = np.ones(self.args.num_envs, np.bool_)
+        self._over = reported(infos, "over", ~everywhere)
+        self.begin_episodes(infos, everywhere)
         return observations
 
     def step(self, actions: NDArray[Any], tally: Tally) -> Played:
@@ -202,9 +205,15 @@ class Trainer(ABC):
         self._episode_return += rewards
         self._episode_length += 1
         tally.note(n_steps, seconds, infos, ended, self._episode_return, self._episode_length)
-        self._episode_return[ended] = 0.0
-        self._episode_length[ended] = 0
+        self.begin_episodes(infos, ended)
         return Played(observations, discounted, n_steps, ended, terminated, truncated & ~terminated, decided, infos)
+
+    def begin_episodes(self, infos: Mapping[str, Any], begun: NDArray[np.bool_]) -> None:
+        """Count what resets have played in the environments ``begun``, bool [num_envs]."""
+        nothing = np.zeros(self.args.num_envs, np.float64)
+        self.grid_steps += int(reported(infos, "reset_steps", nothing)[begun].sum())
+        self._episode_return[begun] = reported(infos, "reset_reward", nothing)[begun]
+        self._episode_length[begun] = 0
 
     def tensor(self, values: Any, dtype: torch.dtype | None = None) -> Tensor:
         """A copy of an array on the networks' device."""

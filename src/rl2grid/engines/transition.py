@@ -1,7 +1,7 @@
 """From one decision of the agent to the next: its step and the heuristic steps behind it.
 
 A transition adds up rewards, costs and scores of all its grid steps (paper, Section 3.2). A reset plays
-the heuristic to the first decision; what accrues there belongs to the first transition.
+the heuristic to the first decision; what accrues there is kept apart, as no decision led to it.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 from rl2grid.engines.action_effects import clipping, refusal
 from rl2grid.engines.base import Engine
-from rl2grid.mdp.accumulate import accrue, begin_episode, begin_transition
+from rl2grid.mdp.accumulate import accrue, begin_episode, begin_transition, end_reset
 from rl2grid.mdp.actions import DO_NOTHING, StepAction, one_change
 from rl2grid.mdp.heuristics import is_safe, reconnect_action, recovery_action
 from rl2grid.mdp.legality import verdict_on
@@ -47,6 +47,7 @@ class Transitions:
         begin_episode(state, i)
         self._announce(i)
         self._play_heuristic(i)
+        end_reset(state, i)
 
     def play(self, i: int, action: StepAction) -> None:
         """Play the agent's action and all heuristic steps to the next decision.
@@ -54,8 +55,7 @@ class Transitions:
         The flags ``illegal`` and ``ambiguous`` keep what happened to the agent's own action.
         """
         state = self.engine.state
-        if state.decisions[i] > 0:
-            begin_transition(state, i)
+        begin_transition(state, i)
         state.decisions[i] += 1
         refused = refusal(self.engine.grid, verdict_on(state, i, action))
         self._step(i, action)

@@ -1,7 +1,8 @@
 """The six values that libraries of safe reinforcement learning expect of a step.
 
 Safety-Gymnasium and OmniSafe read ``observation, reward, cost, terminated, truncated, info``. The cost is that of the
-task's constraint, ``info["cost"]``: summed over the grid steps of the transition, as the reward is.
+task's constraint, ``info["cost"]``: summed over the grid steps of the transition, as the reward is. What the
+heuristic accrued before the first decision is in no step, but in ``info["reset_costs"]``.
 """
 
 from __future__ import annotations

@@ -57,6 +57,7 @@ def play_episode(
     observation, info = env.reset(seed=environment_seed(scenario, seed), options=options)
     agent.reset(0)
     totals: dict[str, Any] = dict.fromkeys((*_TOTALS, *(each.column for each in CONSTRAINTS.values())), 0.0)
+    _add(totals, float(info["reset_reward"]), info["reset_components"], info["reset_costs"])
     decisions = illegal = ambiguous = 0
     over = False
     played: Any = env.unwrapped
@@ -78,7 +79,7 @@ def play_episode(
                 on_decision(action, info)
         observation, reward, terminated, truncated, info = env.step(action)
         over = terminated or truncated
-        _add(totals, float(reward), info)
+        _add(totals, float(reward), info["reward_components"], info["costs"])
         illegal += int(info["illegal"])
         ambiguous += int(info["ambiguous"])
     ending = collapse(state, 0, overloads if info["step"] == decided + 1 else "") if terminated else COMPLETED
@@ -114,8 +115,7 @@ def environment_seed(scenario: str, seed: int) -> int:
 _TOTALS = ("episode_return", "return_survive", "return_overload", "return_cost")
 
 
-def _add(totals: dict[str, Any], reward: float, info: Info) -> None:
-    components, costs = info["reward_components"], info["costs"]
+def _add(totals: dict[str, Any], reward: float, components: dict[str, float], costs: dict[str, float]) -> None:
     totals["episode_return"] += reward
     totals["return_survive"] += components["survive"]
     totals["return_overload"] += components["overload"]

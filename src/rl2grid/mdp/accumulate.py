@@ -4,9 +4,11 @@ A transition is one step of the agent and all steps of the heuristic to the next
 
 1. ``begin_episode`` at a reset, before the heuristic plays to the first decision;
 2. ``accrue`` after every grid step, whoever played it;
-3. ``begin_transition`` before the agent's step of every decision *but the first*: what the heuristic
-   accrued inside the reset belongs to the first transition, so that the rewards and costs of all
-   transitions of an episode add up to those of all its steps.
+3. ``end_reset`` at the end of a reset: what accrued before the first decision is put aside, since no action of the
+   agent had a part in it;
+4. ``begin_transition`` before the agent's step of every decision.
+
+The sums of the reset and of all transitions of an episode add up to those of all its steps.
 """
 
 from __future__ import annotations
@@ -45,6 +47,16 @@ def begin_transition(state: GridState, i: int) -> None:
     state.transition_discount[i] = 1.0
     state.transition_components[i] = 0.0
     state.transition_costs[i] = 0.0
+
+
+@jit
+def end_reset(state: GridState, i: int) -> None:
+    """Put the sums of row ``i`` aside as those of its reset, and zero those of the transition."""
+    state.reset_steps[i] = state.n_steps[i]
+    state.reset_reward[i] = state.transition_reward[i]
+    state.reset_components[i] = state.transition_components[i]
+    state.reset_costs[i] = state.transition_costs[i]
+    begin_transition(state, i)
 
 
 @jit

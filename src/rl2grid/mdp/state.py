@@ -98,6 +98,12 @@ class GridState(NamedTuple):
     transition_components: Annotated[F64, row("component", "SURVIVE, OVERLOAD, COST")]
     transition_costs: Annotated[F64, row("cost", ", ".join(CONSTRAINTS))]
 
+    # Sums over what the heuristic played before the first decision.
+    reset_steps: Annotated[I32, row("", "grid steps of the reset")]
+    reset_reward: Annotated[F64, row("", "sum over the reset")]
+    reset_components: Annotated[F64, row("component", "SURVIVE, OVERLOAD, COST")]
+    reset_costs: Annotated[F64, row("cost", ", ".join(CONSTRAINTS))]
+
     # Sums over the episode.
     episode_return: Annotated[F64, row("", "sum of the rewards")]
     episode_components: Annotated[F64, row("component", "SURVIVE, OVERLOAD, COST")]

@@ -14,7 +14,7 @@ from rl2grid.engines.native.action_notes import note_action
 from rl2grid.engines.native.environments import Environments, open_environments
 from rl2grid.engines.native.orders import Orders, order_one_change
 from rl2grid.engines.native.step import begin_step, dispatch_or_lose, finish_step, reset_row
-from rl2grid.mdp.accumulate import accrue, begin_episode, begin_transition
+from rl2grid.mdp.accumulate import accrue, begin_episode, begin_transition, end_reset
 from rl2grid.mdp.actions import ActionKind
 from rl2grid.mdp.features import write_redispatch_observation, write_topology_observation
 from rl2grid.mdp.heuristics import is_safe, reconnect_action, recovery_action
@@ -74,20 +74,19 @@ def advance(
             reset_row(environments, i)
             begin_episode(state, i)
         else:
-            if state.decisions[i] > 0:
-                begin_transition(state, i)
+            begin_transition(state, i)
             state.decisions[i] += 1
             _order(orders, i, k, first, kinds, targets, masks, injects, values)
             _step(environments, i, reward, weights, gamma)
             note_action(environments.notes, orders, state, i)
             illegal, ambiguous = state.illegal[i], state.ambiguous[i]
-        if heuristic == ALONE:
-            continue
-        while not (state.terminated[i] or state.truncated[i]) and is_safe(state, i):
+        while heuristic != ALONE and not (state.terminated[i] or state.truncated[i]) and is_safe(state, i):
             kind, target = _heuristic_action(state, i, heuristic)
             order_one_change(orders, i, kind, target)
             _step(environments, i, reward, weights, gamma)
         state.illegal[i], state.ambiguous[i] = illegal, ambiguous
+        if begins:
+            end_reset(state, i)
 
 
 @jit
