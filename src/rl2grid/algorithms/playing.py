@@ -47,6 +47,21 @@ def check_environments(algorithm: str, envs: VectorEnv[Any, Any, Any], *, num_en
     return True
 
 
+def check_discount(algorithm: str, envs: VectorEnv[Any, Any, Any], gamma: float) -> None:
+    """Rewards of transitions must be discounted as what follows them.
+
+    Raises:
+        UsageError: an environment that discounts the grid steps of its transitions does so by another factor.
+    """
+    for played in (envs, *getattr(envs.unwrapped, "envs", ())):
+        theirs = getattr(getattr(played.unwrapped, "options", None), "gamma", None)
+        if theirs is not None and theirs != gamma:
+            raise UsageError(
+                f"The environments discount the steps of a transition by gamma={theirs}, {algorithm} learns with "
+                f"gamma={gamma}: give both the same."
+            )
+
+
 def reported(infos: Mapping[str, Any], key: str, missing: NDArray[Any]) -> NDArray[Any]:
     """An array of ``infos``, with the values of ``missing`` where an environment reported none."""
     if key not in infos:

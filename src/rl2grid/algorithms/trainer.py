@@ -32,7 +32,14 @@ from torch import Tensor, nn
 from rl2grid.algorithms.devices import find_device
 from rl2grid.algorithms.hyperparameters import SharedArgs
 from rl2grid.algorithms.networks import NetworkFactory, find_network
-from rl2grid.algorithms.playing import Tally, check_environments, of_transition, reported, resume_environments
+from rl2grid.algorithms.playing import (
+    Tally,
+    check_discount,
+    check_environments,
+    of_transition,
+    reported,
+    resume_environments,
+)
 from rl2grid.envs.spec import spec_of
 from rl2grid.errors import UsageError
 
@@ -80,6 +87,7 @@ class Trainer(ABC):
         self.continuous = check_environments(
             args.algorithm, envs, num_envs=args.num_envs, mask_actions=args.mask_actions
         )
+        check_discount(args.algorithm, envs, args.gamma)
         self.envs = envs
         self.generator = torch.Generator().manual_seed(args.seed)
         self.spec = spec_of(envs)
