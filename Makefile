@@ -5,6 +5,8 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 # Grid2Op's redispatch solver slows down sixfold on contended BLAS threads.
 export OPENBLAS_NUM_THREADS := 1
+# Libraries are compiled to byte code once: without it PyTorch and Grid2Op take seconds longer in every process.
+unexport PYTHONDONTWRITEBYTECODE
 WORKERS ?= 2
 # The theme announces its successor at every build.
 export NO_MKDOCS_2_WARNING := 1
