@@ -20,6 +20,6 @@ def find_device(name: str) -> torch.device:
         raise UsageError("PyTorch finds no CUDA device here: set device to cpu or auto.")
     if name == "cpu" or not available:
         return torch.device("cpu")
-    # Without it, cuBLAS is refused by use_deterministic_algorithms.
+    # Without it, cuBLAS is refused by deterministic algorithms.
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
     return torch.device("cuda")
