@@ -1,30 +1,32 @@
 """Trainings in processes of their own that are killed: from outside, or by themselves at the worst moments.
 
-As a program, ``killed_runs.py <folder> <moment> <algorithm> <task> <changes>`` begins or resumes the toy run of
-:mod:`toy_runs` in the folder. A moment is ``place:count``: it dies when it comes to the place for that time.
+A moment is ``place:count``: the process dies when it comes to the place for that time. Processes are forked from one
+that has loaded the libraries, which takes several seconds.
 """
 
 from __future__ import annotations
 
-import json
+import multiprocessing
 import os
-import subprocess
-import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
-from toy_runs import environment, falling, toy_envs, toy_run
+from toy_runs import falling, toy_envs, toy_run
 
 from rl2grid.algorithms import replay
 from rl2grid.algorithms.registry import find_algorithm
+from rl2grid.errors import UsageError
 from rl2grid.records import metrics
 from rl2grid.training import runs
 
 KILLED = 9
 """Exit status of a process that died at its moment."""
 NEVER = "never:1"
+FORKS = multiprocessing.get_context("forkserver")
+FORKS.set_forkserver_preload(["killed_runs", "torch.utils.tensorboard"])
 
 
 def run_until_killed(
@@ -37,14 +39,35 @@ def run_until_killed(
     **changes: Any,
 ) -> int:
     """Train or resume in a process of its own; returns its exit status."""
-    words = [sys.executable, __file__, str(folder), moment, algorithm, task, json.dumps(changes)]
-    with subprocess.Popen(words, env=environment(), stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "ready\n"
-        if after_seconds is not None:
-            time.sleep(after_seconds)
-            process.kill()
-        return process.wait()
+    begun = FORKS.Event()
+    process = FORKS.Process(target=main, args=(begun.set, folder, moment, algorithm, task, changes))
+    process.start()
+    assert begun.wait(60)
+    if after_seconds is not None:
+        time.sleep(after_seconds)
+        process.kill()
+    process.join()
+    assert process.exitcode is not None
+    return process.exitcode
+
+
+def refusal_of_a_second_process(folder: Path) -> str:
+    """What another process is told that goes on with a run."""
+    mine, theirs = FORKS.Pipe()
+    process = FORKS.Process(target=_try_to_resume, args=(folder, theirs))
+    process.start()
+    refusal: str = mine.recv()
+    process.join()
+    return refusal
+
+
+def _try_to_resume(folder: Path, answers: Any) -> None:
+    try:
+        runs.resume(folder)
+    except UsageError as error:
+        answers.send(str(error))
+    else:
+        answers.send("")
 
 
 class Moment:
@@ -143,19 +166,18 @@ def slow_down(algorithm: str) -> None:
     trainer.iterate = slow
 
 
-def main(folder: Path, moment: str, algorithm: str, task: str, changes: dict[str, Any]) -> None:
+def main(
+    begin: Callable[[], None], folder: Path, moment: str, algorithm: str, task: str, changes: dict[str, Any]
+) -> None:
+    """Begin or resume the toy run of :mod:`toy_runs` in the folder."""
     own = Moment(moment)
     die_while_saving(own)
     die_while_recording(own)
     die_while_remembering(own)
     if moment == NEVER:
         slow_down(algorithm)
-    print("ready", flush=True)
+    begin()
     if folder.exists():
         runs.resume(folder, evaluate=falling, make_envs=toy_envs)
     else:
         runs.train(toy_run(folder, algorithm, task, **changes), evaluate=falling, make_envs=toy_envs)
-
-
-if __name__ == "__main__":
-    main(Path(sys.argv[1]), *sys.argv[2:5], json.loads(sys.argv[5]))

@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import random
 import signal
-import subprocess
-import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -16,9 +14,9 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from killed_runs import KILLED, run_until_killed
+from killed_runs import KILLED, refusal_of_a_second_process, run_until_killed
 from toy_grid import ToyGrid
-from toy_runs import SMALL, assert_same, assert_same_run, environment, falling, request, toy_envs
+from toy_runs import SMALL, assert_same, assert_same_run, falling, request, toy_envs
 
 from rl2grid.algorithms.checkpoint import load_checkpoint, save_checkpoint
 from rl2grid.algorithms.policy_agent import PolicyAgent, load_agent
@@ -170,16 +168,7 @@ def test_a_run_has_one_writer(tmp_path: Path):
         raise AssertionError("got past the lock")
 
     def evaluate(agent: PolicyAgent) -> Mapping[str, float]:
-        script = (
-            "import sys\nfrom pathlib import Path\n"
-            "from rl2grid.errors import UsageError\nfrom rl2grid.training.runs import resume\n"
-            "try:\n    resume(Path(sys.argv[1]))\nexcept UsageError as error:\n    sys.exit(str(error))\n"
-        )
-        process = subprocess.run(
-            [sys.executable, "-c", script, str(tmp_path / "run")], env=environment(), capture_output=True, text=True
-        )
-        assert process.returncode == 1
-        assert "is being written by another process" in process.stderr
+        assert "is being written by another process" in refusal_of_a_second_process(tmp_path / "run")
         return {"survival": 0.0}
 
     train(request(tmp_path / "run", evaluate_every=10_000), evaluate=evaluate, make_envs=toy_envs)
