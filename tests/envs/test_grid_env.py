@@ -238,6 +238,15 @@ def test_simulate_returns_what_a_step_would_and_changes_nothing(plain):
         plain.simulate(7, horizon=5)
 
 
+def test_sums_of_a_simulation_are_of_its_step_alone(idle):
+    _, before = idle.reset(seed=0, options={"scenario": month(), "start": 0})
+    assert before["reset_steps"] > 100
+    result = idle.simulate(7)
+    assert (result.info["n_steps"], result.info["reset_steps"], result.info["reset_reward"]) == (1, 0, 0.0)
+    assert not any({**result.info["reset_components"], **result.info["reset_costs"]}.values())
+    assert result.info["episode_return"] == result.reward
+
+
 @pytest.mark.parametrize(
     ("action", "message"),
     [(209, "0 to 208"), (-1, "0 to 208"), (1.0, "0 to 208"), ([1, 2], "0 to 208"), ("a", "0 to 208")],

@@ -12,6 +12,7 @@ from rl2grid.mdp.termination import GameOver
 WEIGHTS = (1.0, 0.5, 0.25)
 GAMMA = 0.9
 TRANSITION_SUMS = ("transition_reward", "transition_discounted", "transition_components", "transition_costs", "n_steps")
+RESET_SUMS = ("reset_steps", "reset_reward", "reset_components", "reset_costs")
 EPISODE_SUMS = ("episode_return", "episode_components", "episode_costs", "episode_scores", "decisions")
 
 
@@ -57,9 +58,11 @@ def test_a_new_episode_starts_from_zero_and_leaves_flags_alone(state):
     state.excused[0, 2] = state.attacked[0, 2] = True
     state.line_status[0, 3:5] = False
     play(state, [(1.0, -1.0, -1.0)])
+    end_reset(state, 0)
+    play(state, [(1.0, -1.0, -1.0)])
     assert state.episode_scores[0].any()
     begin_episode(state, 0)
-    for name in TRANSITION_SUMS + EPISODE_SUMS:
+    for name in TRANSITION_SUMS + RESET_SUMS + EPISODE_SUMS:
         assert not getattr(state, name)[0].any(), name
     assert state.transition_discount[0] == 1
     assert state.excused[0, 2]

@@ -31,6 +31,7 @@ from rl2grid.mdp.state import (
 def begin_episode(state: GridState, i: int) -> None:
     """Zero all sums of row ``i``, and its number of decisions. Flags, ``excused`` included, are the engine's."""
     begin_transition(state, i)
+    end_reset(state, i)  # of which nothing was played yet
     state.episode_return[i] = 0.0
     state.episode_components[i] = 0.0
     state.episode_costs[i] = 0.0
