@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +12,6 @@ import pandas as pd
 import torch
 from toy_grid import ToyGrid
 
-import rl2grid
 from rl2grid.algorithms.checkpoint import load_checkpoint
 from rl2grid.algorithms.policy_agent import PolicyAgent
 from rl2grid.algorithms.ppo import Args
@@ -111,9 +109,3 @@ def assert_same(mine: Any, theirs: Any, where: str = "") -> None:
         assert equal(mine, theirs), where
     else:
         assert str(mine) == str(theirs), where
-
-
-def environment() -> dict[str, str]:
-    """Of processes that import what this one imports."""
-    paths = [Path(rl2grid.__file__).parents[1], Path(__file__).parent, Path(__file__).parents[1]]
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, paths))}

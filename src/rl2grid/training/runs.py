@@ -35,7 +35,7 @@ from rl2grid.algorithms.trainer import Trainer
 from rl2grid.envs.registration import register_all
 from rl2grid.errors import UsageError
 from rl2grid.records import logs
-from rl2grid.records.locks import LockedError, take_lock
+from rl2grid.records.locks import LockedError, locked
 from rl2grid.records.trainings import create_run_folder
 from rl2grid.training.energy import EnergyAccount
 from rl2grid.training.interrupts import stop_requests
@@ -301,10 +301,7 @@ def _budget(args: RunArgs, trainer: Trainer) -> int:
 def _locked(folder: Path) -> Iterator[None]:
     """Keep other processes from writing into a run folder; the lock goes with this process, however it ends."""
     try:
-        lock = take_lock(folder)
+        with locked(folder):
+            yield
     except LockedError as error:
         raise UsageError(f"Folder {str(folder)!r} is being written by another process: wait until it ends.") from error
-    try:
-        yield
-    finally:
-        lock.release()
