@@ -102,7 +102,7 @@ def _long_tally(grid_id):
     return compare(grid_id, "mixed", "adversarial", steps=3000, seed=4)
 
 
-@pytest.mark.parametrize("heuristic", ["idle", "recovery"])
+@pytest.mark.parametrize("heuristic", ["idle", "recovery", "careful"])
 @pytest.mark.parametrize("grid_id", ["bus14", "bus36-MO-v0", "bus118-MOB-v1"])
 def test_transitions_agree(grid_id, heuristic):
     """With the heuristic deciding on each engine's own state, transitions have the same length and sums."""
@@ -118,8 +118,8 @@ def test_transitions_agree(grid_id, heuristic):
         action = full_catalogue(grid)[int(random.integers(len(full_catalogue(grid))))]
         for transitions, i in zip(pair, rows, strict=True):
             transitions.play(i, action)
-        for name in ("step", "n_steps", "decisions", "terminated", "truncated"):
-            assert getattr(states[0], name)[0] == getattr(states[1], name)[row], name
+        for name in ("step", "n_steps", "decisions", "terminated", "truncated", "open_since", "split_since"):
+            np.testing.assert_array_equal(getattr(states[0], name)[0], getattr(states[1], name)[row], name)
         for name in ("transition_reward", "transition_discounted", "transition_costs", "episode_scores"):
             np.testing.assert_allclose(getattr(states[1], name)[row], getattr(states[0], name)[0], rtol=0, atol=1e-4)
 

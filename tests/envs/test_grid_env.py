@@ -9,6 +9,7 @@ from gymnasium.utils.env_checker import check_env
 
 import rl2grid  # noqa: F401 - registers the tasks
 from rl2grid.engines import ENGINES
+from rl2grid.engines.native import playing
 from rl2grid.envs.info import INFO_KEYS
 from rl2grid.envs.tasks import all_tasks
 from rl2grid.errors import UsageError
@@ -236,6 +237,12 @@ def test_simulate_returns_what_a_step_would_and_changes_nothing(plain):
         plain.simulate(7, horizon=0)
     with pytest.raises(UsageError, match="no forecast 5 steps ahead"):
         plain.simulate(7, horizon=5)
+
+
+def test_the_careful_heuristic_refuses_a_series_without_forecasts(monkeypatch):
+    monkeypatch.setattr(playing, "horizons_of", lambda scenario: 0)
+    with make("bus14-T0", heuristic="careful") as environment, pytest.raises(UsageError, match="no forecast 1 steps"):
+        environment.reset(seed=0)
 
 
 def test_sums_of_a_simulation_are_of_its_step_alone(idle):

@@ -60,7 +60,7 @@ def two_days() -> dict[str, Any]:
         ("bus14-T0", {}),
         ("bus14-T0", {"heuristic": "idle", "gamma": 0.9}),
         ("bus14-R", {"heuristic": "recovery"}),
-        ("bus36-MO-v0-T0", {"heuristic": "recovery", "split": "validation"}),
+        ("bus36-MO-v0-T0", {"heuristic": "careful", "split": "validation"}),
         ("bus36-MO-v1-R", {"dispatch": "grid2op"}),
         ("bus118-MOB-v1-T0", {"normalize": None}),
         ("bus118-MOB-v1-R", {"heuristic": "recovery", "split": "bundled"}),

@@ -1,11 +1,22 @@
-"""Heuristics: when they play, and what recovery does first."""
+"""Heuristics: when they play, what recovery does first, and what careful may try."""
 
 import numpy as np
 import pytest
 
 from rl2grid.grids import load_grid
 from rl2grid.mdp.actions import ActionKind, is_legal
-from rl2grid.mdp.heuristics import is_safe, reconnect_action, recovery_action
+from rl2grid.mdp.heuristics import (
+    CAREFUL_RHO,
+    candidate_action,
+    careful_candidate,
+    is_careful_enough,
+    is_safe,
+    reconnect_action,
+    recovery_action,
+    remember_move,
+    remember_nothing,
+    remember_topology,
+)
 
 NOTHING = (ActionKind.NOTHING, 0)
 
@@ -93,3 +104,84 @@ def test_decisions_are_those_of_the_definition_and_legal(grid, random_rows):
         assert reconnect_action(random_rows, i) == reconnect
         assert recovery_action(random_rows, i) == expected
         assert is_legal(random_rows, i, *recovery_action(random_rows, i))
+
+
+def candidates(state):
+    """Everything that careful may try, in order, as (:class:`ActionKind`, target)."""
+    found, number = [], careful_candidate(state, 0, 0)
+    while number >= 0:
+        found.append(candidate_action(state, number))
+        number = careful_candidate(state, 0, number + 1)
+    return found
+
+
+def at_step(state, step, *, opened=(), closed=(), splits=(), moves=()):
+    """Show the next step, and let careful remember it; ``moves`` are the agent's in what is split already."""
+    state.step[0] = step
+    for line in opened:
+        open_line(state, line)
+    state.line_status[0, list(closed)] = True
+    for sub in splits:
+        split(state, sub)
+    remember_topology(state, 0)
+    for sub in (*splits, *moves):
+        remember_move(state, 0, sub)
+
+
+def test_careful_tries_what_recovery_would_do_and_then_the_rest(state):
+    remember_nothing(state, 0)
+    at_step(state, 1, splits=(2, 9))
+    at_step(state, 2, opened=(30, 12, 13))
+    state.time_before_cooldown_line[0, 13] = 4
+    closing = [(ActionKind.RECONNECT, 12), (ActionKind.RECONNECT, 30)]
+    assert candidates(state) == [*closing, (ActionKind.RESTORE, 2), (ActionKind.RESTORE, 9)]
+    assert candidates(state)[0] == recovery_action(state, 0)
+    state.time_before_cooldown_sub[0, 2] = 1
+    assert candidates(state) == [*closing, (ActionKind.RESTORE, 9)]
+
+
+def test_careful_leaves_a_split_that_makes_up_for_an_open_line(state):
+    remember_nothing(state, 0)
+    at_step(state, 1, splits=(4,))
+    at_step(state, 2, opened=(12,))
+    at_step(state, 3, splits=(9,))
+    state.time_before_cooldown_line[0, 12] = 10
+    assert candidates(state) == [(ActionKind.RESTORE, 4)], "4 was split before the line was lost"
+    at_step(state, 4, moves=(4,))
+    assert candidates(state) == [], "4 was divided otherwise after the line was lost"
+    at_step(state, 5, closed=(12,))
+    assert candidates(state) == [(ActionKind.RESTORE, 4), (ActionKind.RESTORE, 9)]
+    at_step(state, 6, opened=(12,))
+    state.time_before_cooldown_line[0, 12] = 10
+    assert candidates(state) == [(ActionKind.RESTORE, 4), (ActionKind.RESTORE, 9)], "it was lost again, later"
+
+
+def test_a_line_lost_in_the_step_of_a_split_is_not_what_it_makes_up_for(state):
+    remember_nothing(state, 0)
+    at_step(state, 3, opened=(12,), splits=(9,))
+    state.time_before_cooldown_line[0, 12] = 10
+    assert candidates(state) == [(ActionKind.RESTORE, 9)]
+
+
+def test_careful_forgets_a_substation_that_was_brought_home_and_an_earlier_episode(state):
+    remember_nothing(state, 0)
+    at_step(state, 1, opened=(12,))
+    at_step(state, 2, splits=(9,))
+    first = state.sub_first_element[9]
+    state.topo_vect[0, first : first + state.sub_info[9]] = 1
+    at_step(state, 3)
+    assert state.split_since[0, 9] == -1
+    assert state.open_since[0, 12] == 1
+    remember_nothing(state, 0)
+    assert (state.split_since[0] == -1).all()
+    assert (state.open_since[0] == -1).all()
+
+
+def test_careful_needs_a_forecast_without_a_heavy_line_or_a_game_over(state):
+    state.rho[0, 7] = np.nextafter(CAREFUL_RHO, np.float32(0))
+    assert is_careful_enough(state, 0)
+    state.rho[0, 7] = CAREFUL_RHO
+    assert not is_careful_enough(state, 0)
+    state.rho[0, 7] = 0.0
+    state.terminated[0] = True
+    assert not is_careful_enough(state, 0)

@@ -15,13 +15,22 @@ from rl2grid.grids import load_grid
 from rl2grid.mdp.accumulate import accrue, begin_episode, begin_transition
 from rl2grid.mdp.constraints import lsi_cost, tlo_cost, update_excused
 from rl2grid.mdp.features import observation_size, observation_writer
-from rl2grid.mdp.heuristics import is_safe, reconnect_action, recovery_action
+from rl2grid.mdp.heuristics import (
+    careful_candidate,
+    is_careful_enough,
+    is_safe,
+    reconnect_action,
+    recovery_action,
+    remember_move,
+    remember_topology,
+)
 from rl2grid.mdp.rewards import PRESETS
 from rl2grid.mdp.scores import margin_score, overload_score, topology_score
 from rl2grid.mdp.termination import game_over_reason
 
 ROWS = 12
 SCALARS = (
+    is_careful_enough,
     is_safe,
     recovery_action,
     reconnect_action,
@@ -49,10 +58,19 @@ def evaluate():
             for i in range(ROWS):
                 observation_writer(kind)(state, i, observations[i])
             results[f"{grid_id} observation {kind}"] = observations
+        results[f"{grid_id} careful"] = np.array([_remember(state, i) for i in range(ROWS)])
         _accumulate(state)
         for name, array in zip(state._fields, state, strict=True):
             results[f"{grid_id} state {name}"] = array
     return results
+
+
+def _remember(state, i):
+    """What the careful heuristic may try, from everything remembered on."""
+    remember_topology(state, i)
+    for sub in range(0, len(state.sub_info), 3):
+        remember_move(state, i, sub)
+    return [careful_candidate(state, i, begin) for begin in (0, state.rho.shape[1])]
 
 
 def _accumulate(state):

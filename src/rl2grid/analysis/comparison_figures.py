@@ -18,6 +18,7 @@ from rl2grid.analysis.figures import STEPS_PER_DAY
 from rl2grid.analysis.lifetimes import kaplan_meier, lifetimes
 from rl2grid.analysis.result_tables import AGGREGATES
 from rl2grid.drawing.theme import BLUE, LIGHT, VERMILLION, Theme, style
+from rl2grid.engines import HEURISTICS
 from rl2grid.mdp.constraint_table import THRESHOLDS
 from rl2grid.records.methods import COSTS, Method, resampled_units
 from rl2grid.records.statistics import Estimate, estimate, probability_of_improvement, score_band, share_above
@@ -193,10 +194,10 @@ def draw_costs(methods: Sequence[Method], *, theme: Theme = LIGHT) -> Figure:
 
 
 def draw_heuristics(methods: Sequence[Method], *, theme: Theme = LIGHT) -> Figure:
-    """What the heuristics are worth: survival of each agent without, with idle and with recovery heuristic."""
-    ticks = {"none": "none", "idle": "idle", "recovery": "recovery"}
-    points = [(method.agent, ticks[method.heuristic], method) for method in methods]
-    return _draw_ablation(points, list(ticks), "Heuristic", _title("Survival by heuristic", methods), theme)
+    """What the heuristics are worth: survival of each agent without and with each of those that were played."""
+    ticks = [name for name in ("none", *HEURISTICS) if any(method.heuristic == name for method in methods)]
+    points = [(method.agent, method.heuristic, method) for method in methods]
+    return _draw_ablation(points, ticks, "Heuristic", _title("Survival by heuristic", methods), theme)
 
 
 def draw_levels(methods: Sequence[Method], *, theme: Theme = LIGHT) -> Figure:

@@ -23,8 +23,8 @@ from rl2grid.records.statistics import (
     probability_of_improvement,
 )
 
-HEURISTIC_LETTERS: dict[str, str] = {"none": "V", "idle": "I", "recovery": "R"}
-"""The paper's: vanilla, idle and recovery."""
+HEURISTIC_LETTERS: dict[str, str] = {"none": "V", "idle": "I", "recovery": "R", "careful": "C"}
+"""The paper's, vanilla, idle and recovery; and careful."""
 AGGREGATES: dict[str, Aggregate] = {
     "mean": mean_score,
     "median": median_score,
@@ -140,7 +140,8 @@ def survival_table(methods: Methods, kind: str) -> ResultTable:
     actions = "topology" if kind == "T" else "redispatch"
     caption = (
         f"Mean survival on tasks with {actions} actions (higher is better; best of a task in bold), plus or minus half "
-        f"of its 95% bootstrap interval over {_units(methods, tasks)}. V: vanilla, I: idle and R: recovery heuristic."
+        f"of its 95% bootstrap interval over {_units(methods, tasks)}. "
+        "V: vanilla, I: idle, R: recovery and C: careful heuristic."
     )
     return ResultTable(f"survival-{actions}", caption, columns, tuple(rows))
 

@@ -3,7 +3,7 @@
 ENGINES: tuple[str, ...] = ("native", "reference")
 """Engines by name: ``native`` is ours, compiled; ``reference`` is Grid2Op with LightSim2Grid."""
 
-HEURISTICS: tuple[str, ...] = ("idle", "recovery")
+HEURISTICS: tuple[str, ...] = ("idle", "recovery", "careful")
 """What may play while the grid is safe; without one, the agent decides every step."""
 
 DISPATCHES: tuple[str, ...] = ("exact", "grid2op")

@@ -12,8 +12,18 @@ from dataclasses import dataclass, field
 from rl2grid.engines.action_effects import clipping, refusal
 from rl2grid.engines.base import Engine
 from rl2grid.mdp.accumulate import accrue, begin_episode, begin_transition, end_reset
-from rl2grid.mdp.actions import DO_NOTHING, StepAction, one_change
-from rl2grid.mdp.heuristics import is_safe, reconnect_action, recovery_action
+from rl2grid.mdp.actions import DO_NOTHING, ActionKind, StepAction, one_change
+from rl2grid.mdp.heuristics import (
+    candidate_action,
+    careful_candidate,
+    is_careful_enough,
+    is_safe,
+    reconnect_action,
+    recovery_action,
+    remember_move,
+    remember_nothing,
+    remember_topology,
+)
 from rl2grid.mdp.legality import verdict_on
 from rl2grid.mdp.rewards import RewardFunction
 from rl2grid.mdp.state import GridState
@@ -31,7 +41,7 @@ class Transitions:
     heuristic: str | None
     """One of :data:`rl2grid.engines.HEURISTICS`; None: the agent decides every step."""
     topology_task: bool
-    """On continuous tasks the recovery heuristic only reconnects lines."""
+    """On continuous tasks the heuristics recovery and careful only reconnect lines."""
     reward: RewardFunction
     gamma: float
     """Discount between the grid steps of a transition."""
@@ -45,6 +55,8 @@ class Transitions:
         self.engine.reset(i, plan)
         self.action_effects[i] = ""
         begin_episode(state, i)
+        remember_nothing(state, i)
+        self._remember(i)
         self._announce(i)
         self._play_heuristic(i)
         end_reset(state, i)
@@ -60,6 +72,7 @@ class Transitions:
         refused = refusal(self.engine.grid, verdict_on(state, i, action))
         self._step(i, action)
         self.action_effects[i] = refused or clipping(self.engine.grid, state, i, action)
+        self._remember_moves(i, action)
         illegal, ambiguous = state.illegal[i], state.ambiguous[i]
         self._play_heuristic(i)
         state.illegal[i], state.ambiguous[i] = illegal, ambiguous
@@ -81,13 +94,41 @@ class Transitions:
     def _heuristic_action(self, i: int) -> StepAction:
         if self.heuristic == "idle":
             return DO_NOTHING
+        if self.heuristic == "careful":
+            return self._careful_action(i)
         decide = recovery_action if self.topology_task else reconnect_action
         kind, target = decide(self.engine.state, i)
         return one_change(kind, target)
 
+    def _careful_action(self, i: int) -> StepAction:
+        """The first candidate that the forecast allows; else nothing."""
+        state = self.engine.state
+        end = state.line_status.shape[1] + (len(state.sub_info) if self.topology_task else 0)
+        candidate = careful_candidate(state, i, 0)
+        while 0 <= candidate < end:
+            action = one_change(*candidate_action(state, candidate))
+            if is_careful_enough(self.engine.simulate(i, action, 1), 0):
+                return action
+            candidate = careful_candidate(state, i, candidate + 1)
+        return DO_NOTHING
+
+    def _remember(self, i: int) -> None:
+        if self.heuristic == "careful":
+            remember_topology(self.engine.state, i)
+
+    def _remember_moves(self, i: int, action: StepAction) -> None:
+        """Note the substations that the agent has changed."""
+        state = self.engine.state
+        if self.heuristic != "careful" or state.illegal[i] or state.ambiguous[i]:
+            return
+        for change in action.changes:
+            if change.kind == ActionKind.MOVE:
+                remember_move(state, i, change.target)
+
     def _step(self, i: int, action: StepAction) -> None:
         self.engine.step(i, action)
         self._accrue(self.engine.state, i)
+        self._remember(i)
         self._announce(i)
 
     def _accrue(self, state: GridState, i: int) -> None:

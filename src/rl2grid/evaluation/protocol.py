@@ -62,7 +62,7 @@ def evaluate(
         seeds: of maintenance, opponent and agent; each scenario has its own draws with the same seed
             (:func:`rl2grid.evaluation.episode.environment_seed`).
         start: row of each scenario at which its episodes begin.
-        heuristic: None, ``"idle"``, ``"recovery"`` or :data:`AS_TRAINED`.
+        heuristic: None, ``"idle"``, ``"recovery"``, ``"careful"`` or :data:`AS_TRAINED`.
         workers: processes that play at the same time; 0: this process plays; None: this one on the native engine,
             one per processor core on the reference engine. No influence on results.
         output: folder to store the evaluation in, and to continue it from; None: nothing is stored.

@@ -62,7 +62,7 @@ class Episode:
 
     task: str = _label("id of the task")
     agent: str = _label("what tables call the agent")
-    heuristic: str = _label("`none`, `idle` or `recovery`")
+    heuristic: str = _label("`none`, `idle`, `recovery` or `careful`")
     split: str = _label("split of the month")
     scenario: str = _fact("the month")
     seed: int = _fact("of maintenance, opponent and agent, together with the month")

@@ -41,7 +41,7 @@ class HashedTest:
 
     @property
     def heuristic(self) -> str | None:
-        """``"idle"``, ``"recovery"`` or None."""
+        """``"idle"``, ``"recovery"``, ``"careful"`` or None."""
         keywords = self.configuration.get("env_keywords", self.configuration)
         chosen: str | None = keywords["heuristic"]
         return chosen

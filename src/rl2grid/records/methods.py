@@ -42,7 +42,7 @@ class Method:
 
     @property
     def heuristic(self) -> str:
-        """``none``, ``idle`` or ``recovery``."""
+        """``none``, ``idle``, ``recovery`` or ``careful``."""
         return self.first.heuristic
 
     @property

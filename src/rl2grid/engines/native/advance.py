@@ -13,21 +13,33 @@ from rl2grid.compile import jit
 from rl2grid.engines.native.action_notes import note_action
 from rl2grid.engines.native.environments import Environments, open_environments
 from rl2grid.engines.native.orders import Orders, order_one_change
+from rl2grid.engines.native.simulation import begin_simulation, finish_simulation
 from rl2grid.engines.native.step import begin_step, dispatch_or_lose, finish_step, reset_row
 from rl2grid.mdp.accumulate import accrue, begin_episode, begin_transition, end_reset
 from rl2grid.mdp.actions import ActionKind
 from rl2grid.mdp.features import write_redispatch_observation, write_topology_observation
-from rl2grid.mdp.heuristics import is_safe, reconnect_action, recovery_action
+from rl2grid.mdp.heuristics import (
+    candidate_action,
+    careful_candidate,
+    is_careful_enough,
+    is_safe,
+    reconnect_action,
+    recovery_action,
+    remember_move,
+    remember_nothing,
+    remember_topology,
+)
 from rl2grid.mdp.rewards import default_components, paper_components, released_components
 from rl2grid.mdp.state import GridState
+from rl2grid.structures import copy_row
 
-ALONE, IDLE, RECOVERY, RECONNECT = range(4)
-"""Who plays between two decisions: nobody, or a heuristic (recovery only reconnects on continuous tasks)."""
+ALONE, IDLE, RECOVERY, RECONNECT, CAREFUL, CAREFUL_RECONNECT = range(6)
+"""Who plays between two decisions: nobody, or a heuristic (recovery and careful only reconnect on continuous tasks)."""
 
 DEFAULT, PAPER, RELEASED = range(3)
 """Rewards that are compiled in."""
 
-_NOTHING = int(ActionKind.NOTHING)
+_NOTHING, _MOVE = int(ActionKind.NOTHING), int(ActionKind.MOVE)
 
 Components = tuple[float, float, float]
 
@@ -35,6 +47,7 @@ Components = tuple[float, float, float]
 @jit
 def advance(
     address: int,
+    simulated: int,
     rows: NDArray[np.int64],
     begins: bool,
     first: NDArray[np.int64],
@@ -52,6 +65,7 @@ def advance(
 
     Args:
         address: of the handle to the :class:`~rl2grid.engines.native.environments.Environments`.
+        simulated: address of a handle to one environment, in which the careful heuristic tries things.
         rows: environments, int64 [k].
         begins: show the first row of the episodes; nobody acts.
         first: where the changes of each agent's action begin, and where the last one's end, int64 [k + 1].
@@ -73,6 +87,9 @@ def advance(
         if begins:
             reset_row(environments, i)
             begin_episode(state, i)
+            if heuristic >= CAREFUL:
+                remember_nothing(state, i)
+                remember_topology(state, i)
         else:
             begin_transition(state, i)
             state.decisions[i] += 1
@@ -80,10 +97,15 @@ def advance(
             _step(environments, i, reward, weights, gamma)
             note_action(environments.notes, orders, state, i)
             illegal, ambiguous = state.illegal[i], state.ambiguous[i]
+            if heuristic >= CAREFUL:
+                remember_topology(state, i)
+                _remember_moves(state, orders, i)
         while heuristic != ALONE and not (state.terminated[i] or state.truncated[i]) and is_safe(state, i):
-            kind, target = _heuristic_action(state, i, heuristic)
+            kind, target = _heuristic_action(environments, simulated, i, heuristic)
             order_one_change(orders, i, kind, target)
             _step(environments, i, reward, weights, gamma)
+            if heuristic >= CAREFUL:
+                remember_topology(state, i)
         state.illegal[i], state.ambiguous[i] = illegal, ambiguous
         if begins:
             end_reset(state, i)
@@ -119,12 +141,50 @@ def _order(
 
 
 @jit
-def _heuristic_action(state: GridState, i: int, heuristic: int) -> tuple[int, int]:
+def _heuristic_action(environments: Environments, simulated: int, i: int, heuristic: int) -> tuple[int, int]:
     if heuristic == RECOVERY:
-        return recovery_action(state, i)
+        return recovery_action(environments.state, i)
     if heuristic == RECONNECT:
-        return reconnect_action(state, i)
+        return reconnect_action(environments.state, i)
+    if heuristic >= CAREFUL:
+        return _careful_action(environments, simulated, i, heuristic == CAREFUL_RECONNECT)
     return _NOTHING, 0
+
+
+@jit
+def _careful_action(environments: Environments, simulated: int, i: int, only_lines: bool) -> tuple[int, int]:
+    """The first candidate that the forecast allows; else nothing."""
+    state = environments.state
+    candidate = careful_candidate(state, i, 0)
+    while candidate >= 0 and not (only_lines and candidate >= state.line_status.shape[1]):
+        kind, target = candidate_action(state, candidate)
+        if _forecast_allows(environments, open_environments(simulated), i, kind, target):
+            return kind, target
+        candidate = careful_candidate(state, i, candidate + 1)
+    return _NOTHING, 0
+
+
+@jit
+def _forecast_allows(environments: Environments, trial: Environments, i: int, kind: int, target: int) -> bool:
+    """Whether the careful heuristic may play an action in row ``i``; tried in row 0 of ``trial``."""
+    copy_row(environments.state, i, trial.state, 0)
+    copy_row(environments.hidden, i, trial.hidden, 0)
+    copy_row(environments.flow, i, trial.flow, 0)
+    order_one_change(trial.orders, 0, kind, target)
+    if begin_simulation(trial, environments, i, 1, True) and not dispatch_or_lose(trial, 0):
+        return False
+    finish_simulation(trial)
+    return is_careful_enough(trial.state, 0)
+
+
+@jit
+def _remember_moves(state: GridState, orders: Orders, i: int) -> None:
+    """Note the substations that the agent has changed in row ``i``."""
+    if state.illegal[i] or state.ambiguous[i]:
+        return
+    for change in range(orders.n_changes[i]):
+        if orders.kind[i, change] == _MOVE:
+            remember_move(state, i, orders.target[i, change])
 
 
 @jit

@@ -76,7 +76,9 @@ class NativeEngine:
         # Behind an imagined future: planners come back to it.
         self._true: list[Playing | None] = [None] * n
         self._use(new_environments(grid, self._network, n, self._attacks))
-        self._simulated = Handle(new_environments(grid, self._network, 1, opponent=False))
+        self._simulated = self._new_simulated()
+        # Of threads that play transitions: a question from outside keeps its answer in the one above.
+        self._trials: list[Handle[Environments]] = []
 
     def reset(self, i: int, plan: EpisodePlan) -> None:
         """Begin the episode ``plan`` in environment ``i``."""
@@ -259,6 +261,16 @@ class NativeEngine:
             self._handles.append(Handle(self.environments._replace(flow=flow)))
         return self._handles[thread].address
 
+    def trial_address_for(self, thread: int) -> int:
+        """An environment in which the heuristic that thread ``thread`` plays may try what it thinks of."""
+        while len(self._trials) <= thread:
+            self._trials.append(self._new_simulated())
+        return self._trials[thread].address
+
+    def _new_simulated(self) -> Handle[Environments]:
+        """One environment, which is brought to where another is and played on the forecast."""
+        return Handle(new_environments(self.grid, self._network, 1, opponent=False))
+
     def _use(self, environments: Environments) -> None:
         self.environments = environments
         self.state = environments.state
@@ -279,13 +291,22 @@ class NativeEngine:
         grown = {name: getattr(larger, name) for name in ("outage_line", "outage_begin", "outage_end")}
         self._use(self.environments._replace(hidden=hidden._replace(**grown)))
 
+    def check_horizon(self, i: int, horizon: int) -> None:
+        """Refuse a question about steps that are not forecast.
+
+        Raises:
+            UsageError: the series of environment ``i`` has no forecast so far ahead.
+        """
+        if horizon > self.environments.hidden.horizons[i]:
+            name = self._series_of(i).name
+            raise UsageError(f"Scenario {name.scenario_id!r} has no forecast {horizon} steps ahead.")
+
     def _begin_simulation(self, i: int, action: StepAction, horizon: int) -> bool:
         """Play a step on the forecast up to the setting of the generators; False if they cannot be dispatched."""
         playing = self._playing[i]
         if self.state.terminated[i] or playing is None:
             raise UsageError("Nothing can be simulated after a game over: reset the environment first.")
-        if horizon > self.environments.hidden.horizons[i]:
-            raise UsageError(f"Scenario {playing.name.scenario_id!r} has no forecast {horizon} steps ahead.")
+        self.check_horizon(i, horizon)
         check_changes(self.grid, action.changes)
         self._copy_row(i)
         write_order(self._simulated.structure.orders, 0, action)

@@ -17,6 +17,8 @@ from rl2grid.engines.action_effects import clipping, refusal
 from rl2grid.engines.native.action_notes import ActionNotes, copy_notes, verdict_in
 from rl2grid.engines.native.advance import (
     ALONE,
+    CAREFUL,
+    CAREFUL_RECONNECT,
     DEFAULT,
     IDLE,
     PAPER,
@@ -48,6 +50,15 @@ _COMPILED_IN: dict[Callable[..., Any], int] = {
     paper_components: PAPER,
     released_components: RELEASED,
 }
+_CODES = {
+    ("idle", True): IDLE,
+    ("idle", False): IDLE,
+    ("recovery", True): RECOVERY,
+    ("recovery", False): RECONNECT,
+    ("careful", True): CAREFUL,
+    ("careful", False): CAREFUL_RECONNECT,
+}
+"""What a heuristic is on topology tasks, and on others."""
 _ROWS_PER_THREAD = 8
 """A thread with fewer rows than this costs more than it saves."""
 
@@ -184,7 +195,7 @@ class NativeTransitions(Transitions):
         if not self.is_compiled:
             super().play(i, action)
             return
-        self._advance_part(self.engine.address, self._rows[i : i + 1], commands_of(self.engine.grid, [action]), False)
+        self._advance_part(0, self._rows[i : i + 1], commands_of(self.engine.grid, [action]), False)
         notes = self.engine.environments.notes
         refused = refusal(self.engine.grid, verdict_in(notes, i))
         self.action_effects[i] = refused or clipping(self.engine.grid, notes, i, action)
@@ -198,7 +209,14 @@ class NativeTransitions(Transitions):
         self._advance(rows, commands, num_threads, False)
 
     def begin_rows(self, rows: I64, num_threads: int) -> None:
-        """Play to the first decision in ``rows``, whose episodes the engine has been handed."""
+        """Play to the first decision in ``rows``, whose episodes the engine has been handed.
+
+        Raises:
+            UsageError: the heuristic looks at forecasts, and a series has none.
+        """
+        if self.heuristic == "careful":
+            for i in rows.tolist():
+                self.engine.check_horizon(i, 1)
         self._advance(rows, self._nothing[: len(rows)], num_threads, True)
 
     def write_observations(self, rows: I64, shift: F32, scale: F32, out: F32) -> None:
@@ -217,21 +235,26 @@ class NativeTransitions(Transitions):
     def _advance(self, rows: I64, commands: Commands, num_threads: int, begins: bool) -> None:
         parts = max(1, min(num_threads, len(rows) // _ROWS_PER_THREAD))
         if parts == 1:
-            self._advance_part(self.engine.address, rows, commands, begins)
+            self._advance_part(0, rows, commands, begins)
             return
         bounds = [len(rows) * part // parts for part in range(parts + 1)]
         slices = [slice(first, last) for first, last in itertools.pairwise(bounds)]
-        addresses = [self.engine.address_for(thread) for thread in range(parts)]
+        for thread in range(parts):  # made here: threads must not make room at the same time
+            self._addresses(thread)
 
-        def advance_slice(address: int, part: slice) -> None:
-            self._advance_part(address, rows[part], commands[part], begins)
+        def advance_slice(thread: int, part: slice) -> None:
+            self._advance_part(thread, rows[part], commands[part], begins)
 
-        list(self._threads.map(advance_slice, addresses, slices))
+        list(self._threads.map(advance_slice, range(parts), slices))
 
-    def _advance_part(self, address: int, rows: I64, commands: Commands, begins: bool) -> None:
+    def _addresses(self, thread: int) -> tuple[int, int]:
+        """The environments, and where a heuristic may try things, for one thread."""
+        return self.engine.address_for(thread), self.engine.trial_address_for(thread)
+
+    def _advance_part(self, thread: int, rows: I64, commands: Commands, begins: bool) -> None:
         weights = self.reward.weights
         advance(
-            address,
+            *self._addresses(thread),
             rows,
             begins,
             commands.first,
@@ -249,6 +272,4 @@ class NativeTransitions(Transitions):
     def _heuristic_code(self) -> int:
         if self.heuristic is None:
             return ALONE
-        if self.heuristic == "idle":
-            return IDLE
-        return RECOVERY if self.topology_task else RECONNECT
+        return _CODES[self.heuristic, self.topology_task]
