@@ -28,8 +28,10 @@ from rl2grid.scenarios import cache, generated, library
 from rl2grid.scenarios.episodes import plan_episode
 from rl2grid.scenarios.generator.month import arrays_of
 from rl2grid.scenarios.library import load_scenario
+from rl2grid.scenarios.making import make_packs
 from rl2grid.scenarios.packs import read_raw
-from rl2grid.scenarios.published import MANIFEST, hash_pack, held_out_months
+from rl2grid.scenarios.published import MANIFEST, held_out_months, listed_hashes
+from rl2grid.scenarios.splits import SPLIT_VERSION
 
 RESULTS = Path(__file__).parent / "results" / "packs.json"
 SEED = 10_000
@@ -45,7 +47,7 @@ SETTLING = 2.5
 
 def measure(grid: Grid) -> dict[str, Any]:
     """Sizes in bytes, times in milliseconds: the median of :data:`REPEATS`."""
-    list(generated.make_packs(grid, [(SEED, month) for month in range(generated.MONTHS)], workers=1))
+    list(make_packs(grid, [(SEED, month) for month in range(generated.MONTHS)], workers=1))
     packs = [generated.pack_path(grid, SEED, month) for month in range(generated.MONTHS)]
     name = f"generated/{generated.month_name(SEED, 7)}"
     raw = read_raw(packs[7])
@@ -101,14 +103,13 @@ def once(work: Callable[[], object]) -> float:
     return round(1e3 * (time.perf_counter() - began), 3)
 
 
-def publish(grid: Grid, workers: int) -> dict[str, str]:
+def publish(grid: Grid, workers: int | None) -> dict[str, str]:
     """Hashes of the held-out months, which are made where they are not there."""
     months = [generated.parse_months(name) for name in held_out_months()]
-    for done in generated.make_packs(grid, [(each.seed, each.first) for each in months], workers):
+    for done in make_packs(grid, [(each.seed, each.first) for each in months], workers):
         print(f"\r{grid.id}: {done} of {len(months)} months", end="", flush=True)
     print()
-    hashes = {name: hash_pack(grid, name) for name in held_out_months()}
-    return {name: digest for name, digest in sorted(hashes.items()) if digest is not None}
+    return listed_hashes(grid)
 
 
 def record(path: Path, section: str, grid_id: str, value: dict[str, Any]) -> None:
@@ -122,12 +123,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("command", choices=("open", "manifest"))
     parser.add_argument("grids", nargs="*", default=list(GRID_IDS))
-    parser.add_argument("--workers", type=int, default=1, help="processes that make months (manifest)")
+    parser.add_argument("--workers", type=int, default=None, help="processes that make months (manifest)")
     arguments = parser.parse_args()
     for grid in map(load_grid, arguments.grids):
         if arguments.command == "manifest":
             path = Path(str(resources.files("rl2grid.scenarios") / MANIFEST))
-            record(path, generated.VERSION, grid.id, publish(grid, arguments.workers))
+            record(path, f"{generated.VERSION} {SPLIT_VERSION}", grid.id, publish(grid, arguments.workers))
             continue
         with tempfile.TemporaryDirectory() as folder:
             os.environ["RL2GRID_DATA"] = folder

@@ -16,7 +16,7 @@ from rl2grid.evaluation import protocol
 from rl2grid.records.episodes import EPISODES_FILE, read_episodes
 from rl2grid.training.request import RunArgs
 
-MONTH = "generated/700000-00"
+MONTH = "generated/710000-00"
 
 
 def test_all_words_are_there_and_documented():

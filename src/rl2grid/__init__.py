@@ -60,7 +60,7 @@ def train(
     folder: str | Path | None = None,
     preset: str = "default",
     hyperparameters: Mapping[str, Any] | None = None,
-    validation_months: int | None = None,
+    validation_months: int | None = 20,
     evaluate_every: int = 50_000,
     progress: bool = True,
     **options: Any,
@@ -75,7 +75,7 @@ def train(
         folder: Where the run is written, a folder that does not exist yet; None: ``runs/<task>-<algorithm>-<seed>``.
         preset: Where the hyperparameters come from that are not given.
         hyperparameters: Of the algorithm, such as ``{"total_timesteps": 100_000, "seed": 1}``.
-        validation_months: Validation months that pick the best policy, evenly spread; None: all, 0: none.
+        validation_months: How many validation months pick the best policy; None: all, 0: none.
         evaluate_every: Decisions between two validations; there is one more at the end.
         progress: Whether to show a progress bar.
         options: Keywords of ``gymnasium.make``, such as ``heuristic`` or ``reward``.

@@ -17,8 +17,8 @@ from rl2grid.evaluation.protocol import evaluate
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two evaluations of a month of bus14, which both lose within days."""
     folder = tmp_path_factory.mktemp("evaluations")
-    evaluate("do-nothing", "bus14-T0", scenarios=["generated/700000-00"], output=folder / "nothing")
-    evaluate("random", "bus14-T0", scenarios=["generated/700000-00"], output=folder / "random")
+    evaluate("do-nothing", "bus14-T0", scenarios=["generated/710000-00"], output=folder / "nothing")
+    evaluate("random", "bus14-T0", scenarios=["generated/710000-00"], output=folder / "random")
     return folder
 
 

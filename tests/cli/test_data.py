@@ -58,11 +58,10 @@ def test_months_are_made_once_and_listed(capsys, folder: Path) -> None:
 
 
 def test_months_of_a_split_are_made_and_counted(capsys, monkeypatch) -> None:
-    monkeypatch.setattr(data, "HELD_OUT_SPLITS", {"test": ("800000-00", "800001-07")})
-    assert main(["data", "make", "bus14", "--split", "test", "--workers", "1"]) == 0
-    capsys.readouterr()
+    assert main(["data", "make", "bus14", "--split", "test", "--months", "2", "--workers", "1"]) == 0
+    assert "2 months of bus14" in capsys.readouterr().out
     main(["data", "list", "bus14"])
-    assert "test 2/20" in capsys.readouterr().out
+    assert "test 2/500" in capsys.readouterr().out
 
 
 def test_an_interrupted_making_goes_on(capsys, monkeypatch) -> None:
@@ -131,7 +130,8 @@ def test_a_bad_folder_is_named_by_file_column_and_row(capsys, folder: Path, file
         (["make", "bus14", "--seed", "1", "--months", "4-3"], "numbers from 0 to 11"),
         (["make", "bus14", "--seed", "1", "--workers", "0"], "at least 1 process"),
         (["make", "bus14", "--split", "train"], "choose from 'validation', 'test'"),
-        (["make", "bus14", "--split", "test", "--months", "3"], "leave --months out"),
+        (["make", "bus14", "--split", "test", "--months", "501"], "no first 501 months: choose from 1 to 500"),
+        (["make", "bus14", "--split", "validation", "--months", "0-3"], "choose from 1 to 200"),
         (["import", "bus14", "nowhere"], "There is no scenario folder"),
         (["export", "bus14", "bundled/9", "mine"], "choose one of bundled/0000"),
         (["export", "bus14", "generated/7", "mine"], "must look like 17-03"),

@@ -12,7 +12,7 @@ from rl2grid.evaluation.protocol import evaluate
 from rl2grid.records.entries import episode_hash
 from rl2grid.records.episodes import FACTS
 
-MONTH = "generated/700000-00"
+MONTH = "generated/710000-00"
 
 
 @pytest.fixture(scope="module")

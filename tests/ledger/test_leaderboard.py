@@ -22,7 +22,7 @@ from rl2grid.records.entries import episode_hash, read_entry, write_entry
 from rl2grid.records.episodes import FACTS
 from rl2grid.records.evaluations import identity_hash
 
-MONTHS = ["generated/700000-00", "generated/700003-09"]
+MONTHS = ["generated/710000-00", "generated/710003-09"]
 Contents = dict[str, Any]
 
 
@@ -138,7 +138,7 @@ def _unknown_month(contents: Contents) -> None:
 
 def _another_month(contents: Contents) -> None:
     for episode in contents["episodes"][2:]:
-        episode["scenario"] = "generated/700001-07"
+        episode["scenario"] = "generated/710001-07"
     rehash(contents)
 
 
@@ -178,8 +178,8 @@ def _text_for_a_number(contents: Contents) -> None:
 @pytest.mark.parametrize(
     ("change", "part"),
     [
-        (_survival, "was changed: the episode generated/700003-09, seed 0 does not have the hash"),
-        (_survival_to_the_last_bit, "was changed: the episode generated/700000-00, seed 0 does not have the hash"),
+        (_survival, "was changed: the episode generated/710003-09, seed 0 does not have the hash"),
+        (_survival_to_the_last_bit, "was changed: the episode generated/710000-00, seed 0 does not have the hash"),
         (_no_such_action, "seed 1 are not ids of 0 to 49"),
         (_fewer_actions, "decisions and"),
         (_broken_actions, "is a damaged entry"),
@@ -212,9 +212,9 @@ def test_what_was_changed_is_refused(tmp_path, contents, change, part):
 @pytest.mark.parametrize(
     ("change", "episode", "part"),
     [
-        (_survival_with_its_hash, "generated/700003-09, seed 0", "differs: its survival is stored as"),
-        (_another_action, "generated/700003-09, seed 1", ""),
-        (_fewer_actions_and_decisions, "generated/700000-00, seed 1", "goes on after its"),
+        (_survival_with_its_hash, "generated/710003-09, seed 0", "differs: its survival is stored as"),
+        (_another_action, "generated/710003-09, seed 1", ""),
+        (_fewer_actions_and_decisions, "generated/710000-00, seed 1", "goes on after its"),
     ],
 )
 def test_what_the_actions_do_not_make_is_told(tmp_path, contents, change, episode, part):

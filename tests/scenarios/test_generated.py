@@ -19,6 +19,7 @@ from rl2grid.scenarios.cache import data_folder
 from rl2grid.scenarios.episodes import MAX_STEPS, EpisodePlan, maintenance_matrix, plan_episode
 from rl2grid.scenarios.generator import month as generator
 from rl2grid.scenarios.library import load_scenario
+from rl2grid.scenarios.series_hash import hash_of_series
 from rl2grid.scenarios.splits import FIRST_TRAINING_SEED, HELD_OUT_SPLITS, TRAINING_SEEDS
 
 BUS14 = load_grid("bus14")
@@ -109,20 +110,15 @@ def test_packs_of_another_generator_are_not_read(made, monkeypatch) -> None:
     assert made == [(17, 3), (17, 3)]
 
 
-def test_making_skips_what_is_there(made) -> None:
-    assert list(generated.make_packs(BUS14, [(3, 1), (3, 0)], workers=1)) == [0, 1, 2]
-    assert list(generated.make_packs(BUS14, [(3, 0), (3, 1), (3, 2)], workers=1)) == [2, 3]
-    assert made == [(3, 0), (3, 1), (3, 2)]
-
-
-@pytest.mark.slow
-def test_processes_make_the_same_packs(made) -> None:
-    months = [(3, 0), (3, 1), (4, 0)]
-    assert list(generated.make_packs(BUS14, months, workers=2))[-1] == 3
-    packs = [generated.pack_path(BUS14, *month).read_bytes() for month in months]
-    shutil.rmtree(generated.pack_folder(BUS14))
-    list(generated.make_packs(BUS14, months, workers=1))
-    assert packs == [generated.pack_path(BUS14, *month).read_bytes() for month in months]
+def test_the_hash_of_a_month_is_in_the_head_of_its_pack(made) -> None:
+    first = generated.series_hash(BUS14, "17-03")
+    assert generated.series_hash(BUS14, "17-03+04") == f"{first}+{generated.series_hash(BUS14, '17-04')}"
+    assert made == [(17, 3), (17, 4)]
+    assert not (data_folder() / "series").exists(), "nothing was expanded"
+    scenario = load_scenario("bus14", "generated/17-03")
+    assert hash_of_series(scenario.load_p, scenario.load_q, scenario.prod_p) == first
+    generated.pack_path(BUS14, 17, 3).write_bytes(b"no pack")
+    assert generated.series_hash(BUS14, "17-03") == first
 
 
 def test_only_the_latest_expanded_months_are_kept_and_mapped_ones_stay_readable(made, monkeypatch) -> None:

@@ -2,7 +2,9 @@
 
 import hashlib
 import json
+import re
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -13,23 +15,30 @@ from rl2grid.cli.main import main
 from rl2grid.grids import GRID_IDS, load_grid
 from rl2grid.scenarios import generated, library, published
 from rl2grid.scenarios.library import load_scenario
+from rl2grid.scenarios.making import make_packs
 from rl2grid.scenarios.packs import read_raw
-from rl2grid.scenarios.published import DeviationWarning, compare_with_published, hash_of_series, hash_pack
+from rl2grid.scenarios.published import DeviationWarning, compare_with_published, hash_pack
+from rl2grid.scenarios.series_hash import hash_of_series
+from rl2grid.scenarios.splits import SPLIT_VERSION
 
 BUS14 = load_grid("bus14")
 NAMES = ("17-03", "17-04")
 
 
 @pytest.fixture
-def manifest(monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
-    """What was published of bus14: a month as it is, and one of which a hash differs."""
-    for _ in generated.make_packs(BUS14, [(17, 3), (17, 4)], workers=1):
+def manifest(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, str]]:
+    """Hashes of two months of bus14: published are the first as it is, and another than the second."""
+    for _ in make_packs(BUS14, [(17, 3), (17, 4)], workers=1):
         pass
-    hashes = {"17-03": hash_pack(BUS14, "17-03"), "17-04": "0" * 64}
-    monkeypatch.setattr(published, "_manifest", lambda: {generated.VERSION: {"bus14": hashes}})
+    hashes = {name: str(hash_pack(BUS14, name)) for name in NAMES}
+    monkeypatch.setattr(published, "HELD_OUT_SPLITS", {"test": NAMES})
+    version = f"{generated.VERSION} {SPLIT_VERSION}"
+    monkeypatch.setattr(published, "_manifest", lambda: {version: {"bus14": {"test": hashes["17-03"][:8] + 8 * "0"}}})
     monkeypatch.setattr(published, "_warned", set())
     library._load_generated_scenario.cache_clear()
-    return hashes
+    published.published_hashes.cache_clear()
+    yield hashes
+    published.published_hashes.cache_clear()
 
 
 def test_the_hash_is_of_the_integers_of_the_month(manifest) -> None:
@@ -66,7 +75,8 @@ def test_packs_are_compared(manifest) -> None:
 
 
 def test_nothing_is_compared_before_it_is_published(manifest, monkeypatch) -> None:
-    monkeypatch.setattr(published, "_manifest", lambda: {"another": {"bus14": manifest}})
+    monkeypatch.setattr(published, "_manifest", lambda: {"1 1": {"bus14": {"test": 16 * "0"}}})
+    published.published_hashes.cache_clear()
     assert compare_with_published(BUS14, NAMES) == (0, [])
 
 
@@ -82,11 +92,16 @@ def test_making_names_what_differs(manifest, capsys, monkeypatch) -> None:
 
 def test_the_published_manifest_is_of_the_held_out_months() -> None:
     file = Path(published.__file__).with_name(published.MANIFEST)
-    for grids in json.loads(file.read_text()).values():
-        assert set(grids) <= set(GRID_IDS)
-        for months in grids.values():
-            assert all(
-                len(digest) == 64 and generated.parse_months(name).n_months == 1 for name, digest in months.items()
-            )
+    manifest = json.loads(file.read_text())
+    assert set(manifest) == {f"{generated.VERSION} {SPLIT_VERSION}"}
     for hashes in map(published.published_hashes, GRID_IDS):
-        assert set(hashes) in (set(), set(published.held_out_months()))
+        assert set(hashes) == set(published.held_out_months())
+        assert all(re.fullmatch("[0-9a-f]{8}", each) for each in hashes.values())
+
+
+def test_what_is_to_be_published_is_what_is_read_back(manifest, monkeypatch) -> None:
+    version = f"{generated.VERSION} {SPLIT_VERSION}"
+    listed = published.listed_hashes(BUS14)
+    monkeypatch.setattr(published, "_manifest", lambda: {version: {"bus14": listed}})
+    published.published_hashes.cache_clear()
+    assert published.published_hashes("bus14") == {name: digest[:8] for name, digest in manifest.items()}

@@ -7,25 +7,32 @@ from rl2grid.errors import UsageError
 from rl2grid.grids import GRID_IDS, load_grid
 from rl2grid.scenarios import generated, months
 from rl2grid.scenarios.episodes import MAX_STEPS, plan_episode
-from rl2grid.scenarios.library import generator_version, list_scenarios, scenario_pack_hash
-from rl2grid.scenarios.splits import FIRST_TRAINING_SEED, HELD_OUT_SPLITS, SPLITS
+from rl2grid.scenarios.library import generator_version, list_scenarios, scenario_pack_hash, split_version
+from rl2grid.scenarios.splits import FIRST_TRAINING_SEED, HELD_OUT_SPLITS, SPLIT_VERSION, SPLITS
 
 BUS14 = load_grid("bus14")
 HELD_OUT = ("validation", "test")
 
 
-def test_held_out_months_are_of_other_years_in_all_seasons() -> None:
+def test_held_out_months_are_of_other_years_and_never_of_training() -> None:
     months = {split: [generated.parse_months(name) for name in names] for split, names in HELD_OUT_SPLITS.items()}
-    assert tuple(months) == HELD_OUT
+    assert {split: len(names) for split, names in months.items()} == {"validation": 200, "test": 500}
     seeds = [each.seed for split in months.values() for each in split]
-    assert len(set(seeds)) == len(seeds) == 40
+    assert len(set(seeds)) == 700
     assert max(seeds) < FIRST_TRAINING_SEED
     assert not any(map(generated.is_training_seed, seeds))
-    for split in months.values():
-        assert {each.first for each in split} == set(range(12))
-        per_season = np.bincount([each.first // 3 for each in split], minlength=4)
-        assert per_season.min() >= 4
-        assert all(each.n_months == 1 for each in split)
+    assert not set(seeds) & {*range(10_000, 20_000), *range(700_000, 700_020), *range(800_000, 800_020)}, "used before"
+
+
+@pytest.mark.parametrize("split", HELD_OUT)
+def test_the_first_months_of_a_list_are_balanced_over_the_seasons(split: str) -> None:
+    months = [generated.parse_months(name) for name in HELD_OUT_SPLITS[split]]
+    assert all(each.n_months == 1 for each in months)
+    for n in range(1, len(months) + 1):
+        per_month = np.bincount([each.first for each in months[:n]], minlength=12)
+        per_season = np.bincount([(each.first + 1) % 12 // 3 for each in months[:n]], minlength=4)
+        assert np.ptp(per_month) <= 1
+        assert np.ptp(per_season) <= 2
 
 
 @pytest.mark.parametrize("grid_id", GRID_IDS)
@@ -38,7 +45,7 @@ def test_splits_are_listed_where_they_end(grid_id: str) -> None:
 
 @pytest.mark.parametrize("split", HELD_OUT)
 def test_held_out_months_are_refused_in_training(split: str) -> None:
-    for name in HELD_OUT_SPLITS[split]:
+    for name in HELD_OUT_SPLITS[split][::50]:
         for window in ("", "[0:288]"):
             with pytest.raises(UsageError, match="not in the split train of bus14: choose one such as generated/"):
                 plan_episode(BUS14, "train", 0, 0, scenario=f"generated/{name}{window}")
@@ -72,3 +79,4 @@ def test_results_name_the_generator_and_what_was_played(monkeypatch: pytest.Monk
         assert version == ("" if split == "bundled" else generated.VERSION)
         assert len(digest) == 16
         assert generator_version("bus14", split) == (version or None)
+        assert split_version("bus14", split) == (SPLIT_VERSION if split in HELD_OUT else None)

@@ -33,6 +33,7 @@ from rl2grid.scenarios.download import download_dataset, find_archive
 from rl2grid.scenarios.export import export_scenario
 from rl2grid.scenarios.full import VARIABLE, full_data_folder
 from rl2grid.scenarios.library import import_folder, load_scenario
+from rl2grid.scenarios.making import make_packs
 from rl2grid.scenarios.progress import Report
 from rl2grid.scenarios.splits import HELD_OUT_SPLITS
 
@@ -85,8 +86,12 @@ def _add_make(actions: Any) -> None:
     parser.add_argument("grid", help="for example bus14")
     wanted = parser.add_mutually_exclusive_group(required=True)
     wanted.add_argument("--seed", type=int, default=None, help="seed of the year")
-    wanted.add_argument("--split", default=None, choices=tuple(HELD_OUT_SPLITS), help="all months of a split")
-    parser.add_argument("--months", default=None, help=f"months of the year, as 0-11 or 0,3,6 (default {ALL_MONTHS})")
+    wanted.add_argument("--split", default=None, choices=tuple(HELD_OUT_SPLITS), help="months of a split")
+    parser.add_argument(
+        "--months",
+        default=None,
+        help=f"of the year, as 0-11 or 0,3,6 (default {ALL_MONTHS}); of a split, how many (default all)",
+    )
     parser.add_argument("--workers", type=int, default=None, help="processes; by default one per core")
     parser.set_defaults(run=_make)
 
@@ -97,7 +102,7 @@ def _make(options: argparse.Namespace) -> int:
     months = _wanted_months(options)
     with _progress(MofNCompleteColumn(), _Rate("/min", 60.0), TimeRemainingColumn()) as bar:
         task = bar.add_task(f"Making months of {grid.id}", total=len(months))
-        for done in generated.make_packs(grid, months, workers):
+        for done in make_packs(grid, months, workers):
             bar.update(task, completed=done)
     print(f"{len(months)} months of {grid.id} are in {generated.pack_folder(grid)}.")
     _compare_with_published(grid, [generated.month_name(*month) for month in months])
@@ -109,9 +114,11 @@ def _wanted_months(options: argparse.Namespace) -> list[tuple[int, int]]:
         if not 0 <= options.seed < 2**63:
             raise UsageError(f"Seed {options.seed} is no seed of a year: choose an integer from 0 to 2^63 - 1.")
         return [(options.seed, month) for month in _month_numbers(options.months or ALL_MONTHS)]
-    if options.months is not None:
-        raise UsageError(f"Split {options.split} says which months are made: leave --months out, or give --seed.")
-    months = [generated.parse_months(name) for name in HELD_OUT_SPLITS[options.split]]
+    names = HELD_OUT_SPLITS[options.split]
+    number = options.months or str(len(names))
+    if not number.isdecimal() or not 1 <= int(number) <= len(names):
+        raise UsageError(f"The split {options.split} has no first {number} months: choose from 1 to {len(names)}.")
+    months = [generated.parse_months(name) for name in names[: int(number)]]
     return [(each.seed, each.first) for each in months]
 
 

@@ -13,7 +13,7 @@ from rl2grid.analysis.summary_table import rich_table
 from rl2grid.cli import keywords
 from rl2grid.envs.tasks import find_task
 from rl2grid.evaluation.flags import environment_flags, evaluate_command
-from rl2grid.evaluation.protocol import evaluate, evenly_spread
+from rl2grid.evaluation.protocol import evaluate, first_months
 
 
 def run(options: argparse.Namespace) -> int:
@@ -29,7 +29,7 @@ def run(options: argparse.Namespace) -> int:
         options.agent,
         task,
         split=options.split,
-        scenarios=None if options.months is None else evenly_spread(task, options.split, options.months),
+        scenarios=None if options.months is None else first_months(task, options.split, options.months),
         seeds=range(options.seeds),
         workers=options.workers,
         output=output,

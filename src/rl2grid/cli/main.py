@@ -111,7 +111,9 @@ def _add_evaluate(commands: argparse._SubParsersAction[_Parser]) -> None:
     )
     parser.add_argument("task", help="for example bus14-T0")
     parser.add_argument("--split", default="validation", choices=SPLITS, help="validation picks models; test is last")
-    parser.add_argument("--months", type=int, default=None, help="of the split, evenly spread; by default all")
+    parser.add_argument(
+        "--months", type=int, default=None, help="the first of the split, balanced over the seasons; by default all"
+    )
     parser.add_argument("--seeds", type=int, default=1, help="episodes per scenario, with seeds 0, 1, ...")
     keywords.add_flags(parser)
     parser.add_argument(

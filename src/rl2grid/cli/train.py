@@ -15,6 +15,7 @@ from rl2grid.cli.keywords import flag_text, reward_of
 from rl2grid.envs.options import TaskOptions, options_of, options_without
 from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
+from rl2grid.scenarios.splits import VALIDATION_MONTHS
 from rl2grid.training.limits import TimeLimit
 
 if TYPE_CHECKING:
@@ -50,8 +51,8 @@ class TrainFlags:
     """Reference engine: processes that play them; None: one per processor core. No influence on results."""
     evaluate_every: int = 50_000
     """Decisions between two evaluations on the validation scenarios."""
-    validation_months: int | None = None
-    """Validation scenarios that are played, evenly spread; None: all; 0: none, so that no best policy is picked."""
+    validation_months: int | None = VALIDATION_MONTHS
+    """How many of the validation scenarios are played; None: all; 0: none, so that no best policy is picked."""
     checkpoint_seconds: float = 60.0
     """A checkpoint is written when the last one is older than this, and at the end."""
     max_minutes: float | None = None

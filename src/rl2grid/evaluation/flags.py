@@ -42,7 +42,7 @@ def evaluate_command(
         task: the task.
         split: whose months.
         seeds: episodes per month.
-        months: of the split, evenly spread; None: all.
+        months: the first of the split; None: all.
         keywords: of ``gymnasium.make``; without ``heuristic``, the one that the agent was trained with is played.
     """
     words = ["rl2grid", "evaluate", agent, short_id(task.id), "--split", split, "--seeds", str(seeds)]

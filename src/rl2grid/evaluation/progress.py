@@ -78,3 +78,23 @@ def show_progress(setting: Setting, jobs: Sequence[Job], progress: bool) -> Iter
     )
     with rich.progress.Progress(*columns) as bar:
         yield ProgressBar(bar, setting, len(jobs))
+
+
+def watch_making(grid_id: str, made: Iterator[int], total: int, progress: bool) -> None:
+    """Make months, with a bar if some are missing and somebody watches.
+
+    Args:
+        grid_id: of which grid.
+        made: yields how many there are.
+        total: how many there will be.
+        progress: whether to show a bar.
+    """
+    there = next(made)
+    if not progress or there == total:
+        for _ in made:
+            pass
+        return
+    with rich.progress.Progress(*rich.progress.Progress.get_default_columns()) as bar:
+        task = bar.add_task(f"Making months of {grid_id}", total=total, completed=there)
+        for there in made:
+            bar.update(task, completed=there)

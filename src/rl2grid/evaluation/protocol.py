@@ -23,13 +23,20 @@ from rl2grid.envs.tasks import Task, constraint_of, find_task
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import make_agent
 from rl2grid.evaluation.crew import Job, Setting, make_crew
-from rl2grid.evaluation.progress import show_progress
+from rl2grid.evaluation.progress import show_progress, watch_making
 from rl2grid.mdp.actions import action_set_hash
 from rl2grid.records.episodes import Episode
 from rl2grid.records.evaluation_folder import open_store
 from rl2grid.records.evaluations import Evaluation, labels
 from rl2grid.records.versions import library_versions
-from rl2grid.scenarios.library import check_in_split, generator_version, list_scenarios, scenario_pack_hash
+from rl2grid.scenarios.library import (
+    check_in_split,
+    generator_version,
+    list_scenarios,
+    make_scenarios,
+    scenario_pack_hash,
+    split_version,
+)
 
 AS_TRAINED = "as trained"
 """Value of ``heuristic``: the one that the policy was trained with; none for agents without training."""
@@ -78,6 +85,7 @@ def evaluate(
     chosen = make_agent(agent, task) if isinstance(agent, str | Path) else agent
     keywords = env_keywords(chosen, {**options, "split": split, "heuristic": heuristic})
     chosen_scenarios = _checked_scenarios(task, split, scenarios)
+    watch_making(task.grid_id, *make_scenarios(task.grid_id, chosen_scenarios), progress)
     jobs = _jobs(chosen_scenarios, seeds, start)
     return run_evaluation(
         # The agent whose identity is stored, not its path: a run that still trains replaces the file.
@@ -91,17 +99,15 @@ def evaluate(
     )
 
 
-def evenly_spread(task: Task, split: str, months: int | None) -> tuple[str, ...]:
-    """Some months of a split, evenly spread over it; ``months`` None, or more than there are: all.
+def first_months(task: Task, split: str, months: int | None) -> tuple[str, ...]:
+    """The first scenarios of a split, of all seasons alike; ``months`` None, or more than there are: all.
 
     Raises:
         UsageError: no such split, or a number of months below 1.
     """
     if months is not None and months < 1:
         raise UsageError(f"months={months} is not allowed: give a number of months, at least 1.")
-    listed = list_scenarios(task.grid_id, split)
-    number = min(months or len(listed), len(listed))
-    return tuple(listed[k * len(listed) // number] for k in range(number))
+    return list_scenarios(task.grid_id, split)[:months]
 
 
 def run_evaluation(
@@ -208,6 +214,7 @@ def question(task: Task, keywords: Mapping[str, Any], start: int, scenarios: Seq
         "start": start,
         "grid_hash": task.grid.hash,
         "generator_version": generator_version(task.grid_id, options["split"]),
+        "split_version": split_version(task.grid_id, options["split"]),
         "scenario_pack_hash": scenario_pack_hash(task.grid_id, options["split"], scenarios),
         "action_set_hash": action_set_hash(task.grid, task.level) if task.kind == "T" else None,
     }

@@ -13,10 +13,8 @@ import functools
 import hashlib
 import itertools
 import json
-import multiprocessing
 import re
-import signal
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import fields
 from importlib import resources
 from importlib.resources.abc import Traversable
@@ -28,8 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rl2grid.errors import UsageError
-from rl2grid.grids import Grid, System, find_system, load_grid
-from rl2grid.grids.systems import add_system
+from rl2grid.grids import Grid, System, find_system
 from rl2grid.scenarios.cache import FORMAT_VERSION, CachedSeries, cached_series, data_folder
 from rl2grid.scenarios.folder import FolderContent
 from rl2grid.scenarios.scenario import Scenario
@@ -166,49 +163,34 @@ def pack_path(grid: Grid, seed: int, month: int) -> Path:
     return pack_folder(grid) / f"{month_name(seed, month)}.pack"
 
 
-def make_packs(grid: Grid, months: Iterable[tuple[int, int]], workers: int) -> Iterator[int]:
-    """Make the packs that are not there yet.
-
-    Args:
-        grid: the grid.
-        months: (seed, month 0 .. 11) of each; those of one year are made together.
-        workers: processes; with 1, this one makes them.
-
-    Yields:
-        How many months there are now, of those asked for.
+def make_months(grid: Grid, seed: int, months: Sequence[int]) -> None:
+    """Make the packs of months of one year, those that are not there.
 
     Raises:
-        UsageError: The data folder cannot be written.
+        UsageError: the data folder cannot be written.
     """
-    asked = sorted(set(months))
-    missing = [month for month in asked if not pack_path(grid, *month).is_file()]
-    done = len(asked) - len(missing)
-    yield done
-    years = {seed: [month for other, month in missing if other == seed] for seed, _ in missing}
-    if workers == 1 or len(years) <= 1:
-        for seed, month in missing:
-            _read_or_make(grid, seed, [month])
-            done += 1
-            yield done
-        return
-    jobs = [(grid.id, seed, numbers) for seed, numbers in years.items()]
-    context = multiprocessing.get_context("spawn")
-    with context.Pool(min(workers, len(jobs)), initializer=_prepare, initargs=(find_system(grid.id),)) as pool:
-        for made in pool.imap_unordered(_make_year, jobs):
-            done += made
-            yield done
+    _read_or_make(grid, seed, months)
 
 
-def _prepare(system: System) -> None:
-    """Make a process know the grid, and leave interrupts to its parent."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    add_system(system)
+def series_hash(grid: Grid, name: str) -> str:
+    """Hash of the values of the months called ``name``, read from the heads of their packs, which are made if need be.
 
+    It covers demand and generation as they are stored; forecasts and voltages follow from these, the grid and the name.
 
-def _make_year(job: tuple[str, int, list[int]]) -> int:
-    grid_id, seed, months = job
-    _read_or_make(load_grid(grid_id), seed, months)
-    return len(months)
+    Raises:
+        UsageError: there are no such months, or the data folder cannot be written.
+    """
+    from rl2grid.scenarios.packs import read_series_hash
+
+    months = parse_months(name)
+    paths = [pack_path(grid, months.seed, month) for month in months.numbers]
+    if not all(path.is_file() for path in paths):
+        make_months(grid, months.seed, months.numbers)
+    hashes = [read_series_hash(path) for path in paths]
+    if None in hashes:
+        make_months(grid, months.seed, months.numbers)
+        hashes = [read_series_hash(path) for path in paths]
+    return "+".join(str(each) for each in hashes)
 
 
 def _content(grid: Grid, months: Months) -> FolderContent:

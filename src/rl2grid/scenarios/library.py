@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from rl2grid.errors import UsageError, one_of
@@ -20,14 +20,17 @@ from rl2grid.scenarios.bundled import interconnections
 from rl2grid.scenarios.cache import data_folder
 from rl2grid.scenarios.folder import read_folder
 from rl2grid.scenarios.full import full_data_folder
+from rl2grid.scenarios.generated import parse_months, series_hash
 from rl2grid.scenarios.imported import imported_names, load_imported, store_imported
+from rl2grid.scenarios.making import make_packs
 from rl2grid.scenarios.progress import Report, ignore
 from rl2grid.scenarios.published import warn_of_deviation
 from rl2grid.scenarios.scenario import Scenario
-from rl2grid.scenarios.splits import SPLITS
+from rl2grid.scenarios.splits import HELD_OUT_SPLITS, SPLIT_VERSION, SPLITS
 
 IMPORTED = "folder"
 """Source of imported series."""
+_GENERATED = "generated/"
 
 _ID = re.compile(r"(?P<source>\w+)/(?P<series>[^\[\]]+)(\[(?P<start>\d+):(?P<stop>\d+)\])?")
 
@@ -72,7 +75,7 @@ def load_scenario(grid_id: str, scenario_id: str) -> Scenario:
         UsageError: Unknown grid or scenario, or a window outside its series.
     """
     system = find_system(grid_id)
-    if scenario_id.startswith("generated/"):
+    if scenario_id.startswith(_GENERATED):
         return _load_generated_scenario(system, scenario_id, data_folder())
     return _load_scenario(system, scenario_id, data_folder(), full_data_folder())
 
@@ -112,14 +115,50 @@ def scenario_pack_hash(grid_id: str, split: str, scenarios: Sequence[str] | None
     rule, listed = system.scenarios.sample(system.grid, split) if scenarios is None else ("", scenarios)
     digest = hashlib.sha256(rule.encode())
     for scenario_id in listed:
-        digest.update(f"{scenario_id} {load_scenario(grid_id, scenario_id).content_hash}\n".encode())
+        digest.update(f"{scenario_id} {_content_hash(system, scenario_id)}\n".encode())
     version = generator_version(grid_id, split)
     return digest.hexdigest()[:16] if version is None else f"{version}-{digest.hexdigest()[:16]}"
+
+
+def make_scenarios(grid_id: str, scenarios: Sequence[str], workers: int | None = None) -> tuple[Iterator[int], int]:
+    """What makes the months of generated scenarios that are missing; all others are there.
+
+    Args:
+        grid_id: the grid.
+        scenarios: ids.
+        workers: see :func:`rl2grid.scenarios.making.make_packs`.
+
+    Returns:
+        An iterator that makes them and yields how many there are so far, and how many there will be.
+
+    Raises:
+        UsageError: a scenario that does not exist.
+    """
+    names = [_series_of(scenario_id) for scenario_id in scenarios if scenario_id.startswith(_GENERATED)]
+    months = {(each.seed, month) for each in map(parse_months, names) for month in each.numbers}
+    return make_packs(find_system(grid_id).grid, months, workers), len(months)
+
+
+def split_version(grid_id: str, split: str) -> str | None:
+    """Version of the list of a split; None: it is a list of recorded series, or has no end."""
+    return SPLIT_VERSION if split in HELD_OUT_SPLITS and generator_version(grid_id, split) is not None else None
 
 
 def generator_version(grid_id: str, split: str) -> str | None:
     """Version of what generated the scenarios of a split; None: they are recorded ones."""
     return find_system(grid_id).scenarios.generator_version(split)
+
+
+def _content_hash(system: System, scenario_id: str) -> str:
+    """Names the values of a scenario; of generated months without expanding them."""
+    if scenario_id.startswith(_GENERATED):
+        return series_hash(system.grid, _series_of(scenario_id))
+    return load_scenario(system.id, scenario_id).content_hash
+
+
+def _series_of(scenario_id: str) -> str:
+    """``17-03`` of ``generated/17-03[0:288]``."""
+    return scenario_id.removeprefix(_GENERATED).partition("[")[0]
 
 
 def _check_split(split: str) -> None:

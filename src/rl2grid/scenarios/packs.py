@@ -1,9 +1,9 @@
 """Packs: one small file per generated month.
 
-A pack is a line of JSON and a compressed body. The body holds what the month is made of, integers of 0.1 MW and
-0.1 MVAr, column by column as differences from row to row; reactive demand as what differs from 0.7 of active demand,
-which is nothing for ordinary loads. Forecasts and voltages follow from the grid, the seed and the month, and are made
-when a pack is expanded.
+A pack is a line of JSON, which names the values by their hash, and a compressed body. The body holds what the month is
+made of, integers of 0.1 MW and 0.1 MVAr, column by column as differences from row to row; reactive demand as what
+differs from 0.7 of active demand, which is nothing for ordinary loads. Forecasts and voltages follow from the grid, the
+seed and the month, and are made when a pack is expanded.
 """
 
 from __future__ import annotations
@@ -24,8 +24,9 @@ from rl2grid.grids import load_grid
 from rl2grid.scenarios.generator.calendar import MONTH_ROWS
 from rl2grid.scenarios.generator.constants import load_constants
 from rl2grid.scenarios.generator.month import RawMonth
+from rl2grid.scenarios.series_hash import hash_of_series
 
-FORMAT = "rl2grid-pack-1"
+FORMAT = "rl2grid-pack-2"
 SUFFIX = ".pack"
 _LEVEL = 9
 """Compression: the smallest files; they are written once."""
@@ -40,12 +41,28 @@ def write_pack(path: Path, raw: RawMonth) -> None:
         "seed": raw.seed,
         "month": raw.month,
         "rows": len(raw.load_p),
+        "series": hash_of_month(raw),
         "sha256": hashlib.sha256(body).hexdigest(),
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     temporary.write_bytes(json.dumps(header).encode() + b"\n" + body)
     os.replace(temporary, path)
+
+
+def hash_of_month(raw: RawMonth) -> str:
+    """Hash of the rows of a month, without those behind its end that only forecasts show."""
+    return hash_of_series(*(matrix[:MONTH_ROWS] for matrix in (raw.load_p, raw.load_q, raw.prod_p)))
+
+
+def read_series_hash(path: Path) -> str | None:
+    """:func:`hash_of_month` of the month in a pack, as the pack was written with it; None where there is no pack."""
+    try:
+        with path.open("rb") as stream:
+            header: dict[str, Any] = json.loads(stream.readline())
+        return str(header["series"]) if header["format"] == FORMAT else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
 
 
 def read_raw(path: Path) -> RawMonth:

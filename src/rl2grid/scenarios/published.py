@@ -1,34 +1,33 @@
 """The held-out months that results are compared on, as they were published.
 
 The generator gives the same months everywhere; should a machine, a compiler or an edit make others, its results are
-not comparable with anybody's. ``manifest.json`` therefore holds a hash of every month of validation and test, by
-version of the generator and grid. A month that differs is played, with a warning.
+not comparable with anybody's. ``manifest.json`` therefore holds the first :data:`DIGITS` of the hash of every month of
+validation and test: by version of the generator, version of the splits, grid and split, all months of a list in one
+string. A month that differs is played, with a warning.
 """
 
 from __future__ import annotations
 
 import functools
-import hashlib
 import json
 import warnings
 from collections.abc import Iterable, Mapping
 from importlib import resources
-from typing import Any, NamedTuple
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import NamedTuple
 
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
 from rl2grid.scenarios.generated import VERSION, pack_path, parse_months
 from rl2grid.scenarios.scenario import Scenario
-from rl2grid.scenarios.splits import HELD_OUT_SPLITS
+from rl2grid.scenarios.series_hash import hash_of_series
+from rl2grid.scenarios.splits import HELD_OUT_SPLITS, SPLIT_VERSION
 
 Hashes = Mapping[str, str]
-"""SHA-256 of a month by its name, for example ``700003-09``."""
+"""First digits of the SHA-256 of a month by its name, for example ``710003-09``."""
 
 MANIFEST = "manifest.json"
-_HASHED = ("load_p", "load_q", "prod_p")
+DIGITS = 8
+"""Hexadecimal ones that are published of each hash."""
 
 
 class DeviationWarning(UserWarning):
@@ -56,27 +55,25 @@ class Comparison(NamedTuple):
     deviations: list[Deviation]
 
 
-def hash_of_series(load_p: NDArray[Any], load_q: NDArray[Any], prod_p: NDArray[Any]) -> str:
-    """SHA-256 of series as integers of 0.1 MW and 0.1 MVAr, which no floating-point unit has a say in.
-
-    Args:
-        load_p: demand, [row, load]: float32 in MW, or int16 in 0.1 MW.
-        load_q: reactive demand, likewise.
-        prod_p: scheduled generation, [row, gen], likewise.
-    """
-    digest = hashlib.sha256()
-    for name, array in zip(_HASHED, (load_p, load_q, prod_p), strict=True):
-        integers = array if array.dtype == np.int16 else np.rint(10 * array)
-        digest.update(f"{name} {integers.shape}".encode())
-        digest.update(np.ascontiguousarray(integers, "<i2").data)
-    return digest.hexdigest()
-
-
+@functools.cache
 def published_hashes(grid_id: str) -> Hashes:
     """Hashes of the held-out months of a grid, as this version of the generator was published with them; none before
     it is.
     """
-    return _manifest().get(VERSION, {}).get(grid_id, {})
+    published = _manifest().get(f"{VERSION} {SPLIT_VERSION}", {}).get(grid_id, {})
+    return {
+        name: hashes[DIGITS * k : DIGITS * (k + 1)]
+        for split, hashes in published.items()
+        for k, name in enumerate(HELD_OUT_SPLITS[split])
+    }
+
+
+def listed_hashes(grid: Grid) -> dict[str, str]:
+    """What is to be published of a grid whose held-out months are made: the hashes of each list in one string."""
+    return {
+        split: "".join(str(hash_pack(grid, name))[:DIGITS] for name in names)
+        for split, names in HELD_OUT_SPLITS.items()
+    }
 
 
 def held_out_months() -> tuple[str, ...]:
@@ -87,15 +84,13 @@ def held_out_months() -> tuple[str, ...]:
 def hash_pack(grid: Grid, name: str) -> str | None:
     """Hash of the month called ``name`` in its pack; None where there is no sound one."""
     # Imported where it is needed: compiling takes long, and comparing what is loaded compiles nothing.
-    from rl2grid.scenarios.generator.calendar import MONTH_ROWS
-    from rl2grid.scenarios.packs import read_raw
+    from rl2grid.scenarios.packs import hash_of_month, read_raw
 
     months = parse_months(name)
     try:
-        raw = read_raw(pack_path(grid, months.seed, months.first))
+        return hash_of_month(read_raw(pack_path(grid, months.seed, months.first)))
     except UsageError:
         return None
-    return hash_of_series(raw.load_p[:MONTH_ROWS], raw.load_q[:MONTH_ROWS], raw.prod_p[:MONTH_ROWS])
 
 
 def compare_with_published(grid: Grid, names: Iterable[str]) -> Comparison:
@@ -103,7 +98,7 @@ def compare_with_published(grid: Grid, names: Iterable[str]) -> Comparison:
     published = published_hashes(grid.id)
     found = {name: hash_pack(grid, name) for name in names if name in published}
     made = {name: digest for name, digest in found.items() if digest is not None}
-    differing = [Deviation(grid.id, name) for name, digest in made.items() if digest != published[name]]
+    differing = [Deviation(grid.id, name) for name, digest in made.items() if digest[:DIGITS] != published[name]]
     return Comparison(len(made), differing)
 
 
@@ -111,7 +106,9 @@ def warn_of_deviation(scenario: Scenario) -> None:
     """Warn if ``scenario`` is a held-out month that differs from the one published: once per grid and process."""
     name = scenario.id.partition("/")[2]
     expected = published_hashes(scenario.grid_id).get(name)
-    if expected is not None and hash_of_series(scenario.load_p, scenario.load_q, scenario.prod_p) != expected:
+    if expected is None:
+        return
+    if hash_of_series(scenario.load_p, scenario.load_q, scenario.prod_p)[:DIGITS] != expected:
         _warn_once(scenario.grid_id, str(Deviation(scenario.grid_id, name)))
 
 
@@ -126,9 +123,9 @@ def _warn_once(grid_id: str, message: str) -> None:
 
 
 @functools.cache
-def _manifest() -> Mapping[str, Mapping[str, Hashes]]:
-    """Hashes by version of the generator, grid and month."""
-    manifest: Mapping[str, Mapping[str, Hashes]] = json.loads(
+def _manifest() -> Mapping[str, Mapping[str, Mapping[str, str]]]:
+    """Hashes by versions of generator and splits, grid and split."""
+    manifest: Mapping[str, Mapping[str, Mapping[str, str]]] = json.loads(
         (resources.files("rl2grid.scenarios") / MANIFEST).read_text()
     )
     return manifest

@@ -41,6 +41,7 @@ from rl2grid.records.studies import (
     write_cell,
     write_result,
 )
+from rl2grid.scenarios.splits import VALIDATION_MONTHS
 from rl2grid.studies.cells import Cell, Training, cell_from_dict, cell_to_dict
 from rl2grid.training import request, runs
 from rl2grid.training.commands import train_command
@@ -145,7 +146,7 @@ def _run_args(cell: Cell, training: Training, folder: Path) -> request.RunArgs:
         num_threads=1 if native else None,
         num_workers=None if native else 0,
         evaluate_every=max(hyperparameters.total_timesteps // training.validations, 1),
-        validation_months=cell.months,
+        validation_months=min(cell.months or VALIDATION_MONTHS, VALIDATION_MONTHS),
         progress=False,
     )
 

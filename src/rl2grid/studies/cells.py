@@ -9,7 +9,7 @@ from typing import Any
 
 from rl2grid.algorithms.registry import Hyperparameters
 from rl2grid.envs.tasks import Task, find_task
-from rl2grid.evaluation.protocol import evenly_spread
+from rl2grid.evaluation.protocol import first_months
 from rl2grid.records.studies import CELLS_FOLDER
 from rl2grid.studies.toml_file import with_tuples
 from rl2grid.training import request
@@ -50,7 +50,7 @@ class Cell:
     """Further keywords of ``gymnasium.make``."""
     split: str
     months: int | None
-    """Months of a split that are played, evenly spread over it; None: all."""
+    """How many months of a split are played; None: all."""
     evaluation_seeds: int
     """Episodes per month, with seeds 0, 1, ..."""
     training: Training | None
@@ -63,7 +63,7 @@ class Cell:
     @property
     def scenarios(self) -> tuple[str, ...]:
         """The months that are played."""
-        return evenly_spread(self.task, self.split, self.months)
+        return first_months(self.task, self.split, self.months)
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from rl2grid.envs.registration import register_all
 from rl2grid.envs.tasks import find_task
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import make_agent
-from rl2grid.evaluation.flags import flags
+from rl2grid.evaluation.flags import evaluate_command, flags
 from rl2grid.evaluation.protocol import evaluate
 from rl2grid.evaluation.recording import record_episode
 from rl2grid.records.evaluations import Evaluation
@@ -35,6 +35,8 @@ DECISIONS = 192_000
 """Two to three minutes on two cores."""
 NUM_ENVS = 64
 """Enough to keep the cores busy while some environments play hours of calm between two decisions."""
+MONTHS = 100
+"""Of the 500 test months: what a minute makes and plays."""
 SEEDS = (0,)
 """Of maintenance and of the random agent: episodes per test month."""
 
@@ -60,7 +62,7 @@ def run_demo(output: Path, decisions: int | None = None) -> Path:
     if not runs.is_finished(run):
         raise KeyboardInterrupt
 
-    console.rule("2/4 Playing 20 months that no agent has seen", align="left")
+    console.rule(f"2/4 Playing {MONTHS} months that no agent has seen", align="left")
     results = [_evaluate(agent, heuristic, output) for agent, heuristic in _contestants(run)]
 
     console.rule("3/4 Recording one episode", align="left")
@@ -73,7 +75,7 @@ def run_demo(output: Path, decisions: int | None = None) -> Path:
         title="PPO on bus14",
         introduction=(
             "An agent that acts only when a line is loaded to 95%, trained for minutes, beside doing nothing and "
-            "acting at random, on 20 months that none of them has seen."
+            f"acting at random, on {MONTHS} months that none of them has seen."
         ),
         curves=[read_training_curve(run, "PPO with the idle heuristic")],
         recordings=[recording],
@@ -118,17 +120,18 @@ def _evaluate(agent: str, heuristic: str | None, output: Path) -> Evaluation:
         agent,
         TASK,
         split="test",
+        scenarios=list_scenarios("bus14", "test")[:MONTHS],
         seeds=SEEDS,
         heuristic=heuristic,
         output=output / "evaluation" / name,
         progress=True,
         name=name,
-        command=f"rl2grid evaluate {agent} {TASK} --split test --seeds {len(SEEDS)} --heuristic {heuristic}",
+        command=evaluate_command(agent, find_task(TASK), "test", len(SEEDS), MONTHS, {"heuristic": heuristic}),
     )
 
 
 def _record(run: Path) -> Recording:
-    scenario = list_scenarios("bus14", "test")[-1]
+    scenario = list_scenarios("bus14", "test")[MONTHS - 1]
     env = gymnasium.make(TASK, split="test", heuristic=HEURISTIC, disable_env_checker=True)
     try:
         agent = make_agent(run, find_task(TASK))

@@ -114,8 +114,9 @@ def run_tuning(
 def best_command(tuning: Tuning, best: Best) -> str:
     """What to type to train with a configuration."""
     args = run_args(tuning, tuning.resolved(best.hyperparameters), None)
-    # Validated on all months, and not as often as while searching, where that is for ending poor trials.
-    args = replace(args, evaluate_every=request.RunArgs.evaluate_every, validation_months=None)
+    # Validated as usual: not as often as while searching, where that is for ending poor trials.
+    usual = request.RunArgs
+    args = replace(args, evaluate_every=usual.evaluate_every, validation_months=usual.validation_months)
     return train_command(args, tuning.preset)
 
 

@@ -58,7 +58,7 @@ class Tuning:
     validations: int
     """Validations of a training, after each of which it may be ended."""
     months: int | None
-    """Months of the validation split that are played, evenly spread over it; None: all."""
+    """How many months of the validation split are played; None: all."""
     hyperparameters: Mapping[str, Any]
     """Changes of the preset that all trainings share."""
     space: Mapping[str, Any]

@@ -29,7 +29,7 @@ def train_command(args: request.RunArgs, preset: str = "default", folder: Path |
     words += [*environment_flags(args.env_keywords), *flags(changes)]
     if args.evaluate_every != request.RunArgs.evaluate_every:
         words += ["--evaluate-every", str(args.evaluate_every)]
-    if args.validation_months is not None:
+    if args.validation_months != request.RunArgs.validation_months:
         words += ["--validation-months", str(args.validation_months)]
     words += [] if folder is None else ["--folder", str(folder)]
     return shlex.join(words)

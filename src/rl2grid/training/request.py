@@ -15,13 +15,13 @@ from rl2grid.algorithms.registry import Algorithm, Hyperparameters, algorithms_f
 from rl2grid.envs.options import TaskOptions
 from rl2grid.envs.tasks import Task, constraint_of, find_task
 from rl2grid.errors import UsageError, one_of
-from rl2grid.evaluation.protocol import evenly_spread
+from rl2grid.evaluation.protocol import first_months
 from rl2grid.mdp.actions import action_set_hash
 from rl2grid.mdp.constraint_table import CONSTRAINTS, THRESHOLDS
 from rl2grid.records.trainings import RUN_FILE, read_configuration
 from rl2grid.records.versions import library_versions
 from rl2grid.scenarios.library import check_in_split, generator_version, scenario_pack_hash
-from rl2grid.scenarios.splits import TRAIN, VALIDATION
+from rl2grid.scenarios.splits import TRAIN, VALIDATION, VALIDATION_MONTHS
 from rl2grid.training.tracking import check_tracking
 
 _ACTIONS = {"T": "discrete", "R": "continuous"}
@@ -49,8 +49,8 @@ class RunArgs:
     """A checkpoint is written when the last one is older than this, and at the end."""
     evaluate_every: int = 50_000
     """Decisions between two evaluations on the validation scenarios; there is one more at the end."""
-    validation_months: int | None = None
-    """Validation scenarios that are played, evenly spread; None: all; 0: none, so that there is no ``best.pt``."""
+    validation_months: int | None = VALIDATION_MONTHS
+    """How many of the validation scenarios are played; None: all; 0: none, so that there is no ``best.pt``."""
     tensorboard: bool = True
     """Whether to write TensorBoard events beside ``metrics.csv``."""
     wandb_project: str | None = None
@@ -130,7 +130,7 @@ def complete(args: RunArgs) -> RunArgs:
     if args.evaluate_every < 1:
         raise UsageError(f"evaluate_every must be at least 1 decision, not {args.evaluate_every}.")
     if args.validation_months != 0:
-        evenly_spread(task, VALIDATION, args.validation_months)
+        first_months(task, VALIDATION, args.validation_months)
     check_tracking(args.wandb_project)
     resolved = replace(args, folder=find_folder(args), env_keywords=keywords)
     find_limits(resolved)  # refuses what cannot be constrained

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from rl2grid.algorithms.policy_agent import PolicyAgent
-from rl2grid.evaluation.protocol import evaluate, evenly_spread
+from rl2grid.evaluation.protocol import evaluate, first_months
 from rl2grid.records.summary import safe_episodes
 from rl2grid.training.request import RunArgs, find_limits
 
@@ -32,7 +32,7 @@ def validator(args: RunArgs) -> Evaluate:
         UsageError: the run cannot be constrained as asked.
     """
     limits = find_limits(args)
-    scenarios = evenly_spread(args.task, "validation", args.validation_months)
+    scenarios = first_months(args.task, "validation", args.validation_months)
     keywords = {name: value for name, value in args.env_keywords.items() if name not in OF_TRAINING}
 
     def validate(agent: PolicyAgent) -> dict[str, float]:
