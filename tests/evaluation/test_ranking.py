@@ -7,7 +7,10 @@ import pytest
 
 from rl2grid.errors import UsageError
 from rl2grid.evaluation import ranking
-from rl2grid.evaluation.ranking import Trials, rank, run_ranking, score
+from rl2grid.evaluation.ranking import Shape, Trials, rank, run_ranking, score
+from rl2grid.grids import load_grid
+from rl2grid.mdp.actions import ActionKind, full_catalogue
+from rl2grid.streams import Purpose, Stream
 
 INF, NAN = np.inf, np.nan
 
@@ -16,9 +19,9 @@ def trials(loadings, base) -> Trials:
     return Trials(np.array(loadings, np.float32), np.array(base, float))
 
 
-def order(loadings, base, n_covered=0):
+def order(loadings, base, n_covered=0, n_first=0, reserved=()):
     tried = trials(loadings, base)
-    return rank(tried, score(tried), n_covered).tolist()
+    return rank(tried, score(tried), Shape(n_covered, n_first, np.array(reserved, np.int32))).tolist()
 
 
 def test_scores_count_what_was_tried():
@@ -77,6 +80,52 @@ def test_calm_points_need_no_coverage():
     assert order(loadings, [0.5, 1.0], 1)[0] == 2
 
 
+def test_level_0_holds_what_is_reserved_whatever_its_trials_say():
+    loadings = [[1.0, 0.9, 0.8, INF, INF], [1.0, 0.9, 0.8, 0.7, INF]]
+    assert order(loadings, [1.0, 1.0]) == [2, 1, 3, 4]
+    assert order(loadings, [1.0, 1.0], n_first=3, reserved=[4]) == [2, 1, 4, 3]
+    assert order(loadings, [1.0, 1.0], n_first=3, reserved=[3, 4]) == [2, 3, 4, 1]
+    assert order(loadings, [1.0, 1.0], n_first=2, reserved=[4, 3]) == [3, 4, 2, 1], "the more helpful one first"
+
+
+def test_what_is_reserved_covers_operating_points_before_others_are_chosen():
+    # Action 3 helps where 1 does, action 2 elsewhere, less.
+    loadings = [[1.0, 0.6, 1.0, 0.6], [1.0, 1.0, 0.9, 1.0]]
+    assert order(loadings, [1.0, 1.0], 2) == [1, 2, 3]
+    assert order(loadings, [1.0, 1.0], 2, n_first=2, reserved=[3]) == [2, 3, 1]
+
+
+def test_each_step_has_the_same_chance_to_be_kept():
+    counts = np.zeros(12)
+    for episode in range(600):
+        kept, choices = [], Stream(0, episode, Purpose.START)
+        for step in range(12):
+            ranking._draw_one(kept, lambda step=step: step, step + 1, 3, choices)
+        assert len(kept) == 3
+        counts[kept] += 1
+    # Five standard deviations of a count of 600 with a chance of a quarter.
+    assert np.abs(counts - 150).max() < 5 * np.sqrt(600 * 0.25 * 0.75)
+
+
+@pytest.mark.parametrize(("grid_id", "n_known"), [("bus14", 5), ("bus36-MO-v0", 10), ("bus118-MOB-v1", 23)])
+def test_lines_to_close_are_those_that_others_open(grid_id, n_known):
+    grid = load_grid(grid_id)
+    tripped = np.zeros(grid.n_line, np.int32)
+    known, left_out = ranking._lines_to_close(grid, tripped)
+    assert len(known) == n_known
+    assert left_out == {}
+    tripped[:] = np.arange(grid.n_line)
+    tripped[known[0]] = 1000
+    closed, left_out = ranking._lines_to_close(grid, tripped)
+    assert len(closed) == min(24, grid.n_line)
+    assert set(known) < set(closed)
+    assert max(left_out.values(), default=0) < min(tripped[line] for line in closed if line not in known)
+    switches = ranking._switches(full_catalogue(grid), closed)
+    taken = full_catalogue(grid).take(switches)
+    assert taken.target.tolist() == closed
+    assert (taken.kind == ActionKind.SWITCH).all()
+
+
 def test_an_action_that_is_not_allowed_does_nothing():
     assert order([[1.0, NAN, 0.9], [1.0, 0.99, 0.99]], [1.0, 1.0]) == [2, 1]
 
@@ -106,6 +155,10 @@ def test_a_run_writes_a_ranking(finished):
     assert metadata["version"] == ranking.VERSION
     assert metadata["command"] == "rl2grid rank bus14 --states 8 --seed 3 --sampling exhaustive"
     assert sum(metadata["states"].values()) == 8
+    assert metadata["closable"].keys() == metadata["states"].keys()
+    switches = ranking._switches(full_catalogue(load_grid("bus14")), metadata["closed_in_level_0"])
+    assert set(load_grid("bus14").maintenance.lines) <= set(metadata["closed_in_level_0"])
+    assert set(switches) <= set(ids[:49])
     assert metadata["trials"] == counts.sum()
     assert metadata["levels_shared_by_halves"].keys() == {"50"}
 

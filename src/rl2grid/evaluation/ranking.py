@@ -5,7 +5,8 @@ After the paper's ranking (Section 3.3, "Action spaces"), exhaustive instead of 
 1. Episodes of training months are played, with planned outages and the opponent: one does nothing, one acts greedily
    when stressed, one also breaks things on purpose. Operating points are kept from all months and hours: mostly
    stressed ones (some loading of at least 0.95, where an agent behind the idle heuristic is asked to act), some
-   nearly stressed or with lines out, some calm.
+   nearly stressed or with lines out, some calm. Of each kind those kept are drawn from all that an episode met, so
+   that lines which are out, and may be closed again, are among them as often as play without a heuristic meets them.
 2. In each of them every action of the catalogue is tried with the AC power flow
    (:mod:`rl2grid.engines.native.what_if`). A trial is an operating point where the cooldowns allow the action; the
    grid survives it unless a load or generator is cut off, the grid falls apart, no flow is found, or a line is loaded
@@ -22,6 +23,10 @@ After the paper's ranking (Section 3.3, "Action spaces"), exhaustive instead of 
    where at first all of an operating point is left, and 1 - 0.7 · share of what was left before an action is chosen.
    (Only those loaded to 0.9 or more in which relief of 0.02 is possible are to be covered.) All other actions follow
    by mean relief. Level 0 is so the best small set that we know, not the 49 best actions, which are much alike.
+5. Level 0 holds the switches of all lines that opponent and planned outages open: without them such a line is lost for
+   ever where no heuristic closes it. So does it those of the lines that protections have opened in these episodes, most
+   often first, as long as switches take at most half of the places. They count as chosen before all others. By their
+   trials they would seldom be: most are openings, of lines in service.
 
 The result is a function of the seed. Every episode and every operating point's results are saved as soon as
 they are there; a run that was interrupted continues where it was.
@@ -32,7 +37,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -48,15 +53,16 @@ from rl2grid.compile import cache_directory
 from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.engines.native.what_if import WhatIf, snapshot_of
 from rl2grid.errors import UsageError, one_of
-from rl2grid.grids import Grid, load_grid
+from rl2grid.grids import Grid, find_system, load_grid
 from rl2grid.mdp.actions import DO_NOTHING, ActionCatalogue, ActionKind, StepAction, full_catalogue
 from rl2grid.powerflow.batch import Snapshot
 from rl2grid.records.files import make_folder
 from rl2grid.scenarios.episodes import plan_episode
-from rl2grid.scenarios.library import scenario_pack_hash
+from rl2grid.scenarios.library import draw_scenario, scenario_pack_hash
+from rl2grid.scenarios.splits import TRAIN
 from rl2grid.streams import Purpose, Stream
 
-VERSION = "1"
+VERSION = "2"
 """Names the method; it changes when the method does."""
 SAMPLINGS = ("exhaustive", "uniform")
 """Every action in every operating point, or some of them, drawn uniformly as in the paper."""
@@ -68,7 +74,6 @@ STRESSED, NEAR = 0.95, 0.9
 _KINDS = ("stressed", "near", "calm")
 _SHARES = {"stressed": 0.7, "near": 0.15, "calm": 0.15}
 _PER_EPISODE = {"stressed": 6, "near": 2, "calm": 2}
-_GAP = 4  # steps between two operating points of an episode
 _EPISODE_STEPS = 2016  # a week
 _EPISODES_PER_YEAR = 4  # making a year takes longer than playing a week of it
 _POLICIES = ("nothing", "greedy", "disturbed")
@@ -76,6 +81,7 @@ _TRIED_BY_GREEDY = 1000
 _COVERED, _WORTHWHILE = 0.9, 0.02
 _TRUST, _RELIEF_WEIGHT = 0.7, 0.001
 _COVERED_WITHOUT_LEVELS = 302  # the size of level 1 on 36 substations
+_CLOSING_SHARE = 0.5  # of the places of level 0
 _CHUNK = 4096  # actions whose statistics are computed at once
 _UNTRIED = np.float16(np.nan)
 
@@ -98,6 +104,28 @@ class Scores(NamedTuple):
     """[action] mean of 1 less the worst loading, within [-1, 1], over the survived trials; 0 where there is none."""
     relief: F64
     """[action] mean gain of margin over all operating points: -1 for a collapse, 0 where it was not tried."""
+
+
+class Shape(NamedTuple):
+    """How many places the first levels have."""
+
+    n_covered: int
+    """Actions chosen for coverage."""
+    n_first: int
+    """Actions of level 0."""
+    reserved: I32
+    """Catalogue ids that level 0 holds anyway, at most :attr:`n_first`."""
+
+
+class Play(NamedTuple):
+    """What the episodes met."""
+
+    kept: dict[str, int]
+    """Operating points of each kind."""
+    closable: dict[str, list[float]]
+    """By kind: share of operating points, and of all steps played, with a line that is out and may be closed."""
+    tripped: I32
+    """[line] how often protections opened it."""
 
 
 def run_ranking(
@@ -139,10 +167,12 @@ def run_ranking(
     folder = _work_folder(grid, work, f"{pack} {states} {seed} {sampling}")
     with _progress(grid_id) as progress:
         laboratory = _Laboratory(grid, num_threads or os.cpu_count() or 1)
-        points, counts = _collect(laboratory, states, seed, folder, progress)
+        points, play = _collect(laboratory, states, seed, folder, progress)
         trials = _try(laboratory, points, seed, sampling, folder, progress)
     scores = score(trials)
-    order = rank(trials, scores, _n_covered(grid))
+    closed, left_out = _lines_to_close(grid, play.tripped)
+    shape = Shape(_n_covered(grid), grid.level_sizes[0] - 1, _switches(laboratory.catalogue, closed))
+    order = rank(trials, scores, shape)
     metadata = {
         "version": VERSION,
         "command": f"rl2grid rank {grid_id} --states {states} --seed {seed} --sampling {sampling}",
@@ -152,9 +182,12 @@ def run_ranking(
         "scenario_pack": pack,
         "seed": seed,
         "sampling": sampling,
-        "states": counts,
+        "states": play.kept,
+        "closable": play.closable,
+        "closed_in_level_0": closed,
+        "tripped_and_not_closed_in_level_0": left_out,
         "trials": int(scores.trials.sum()),
-        "levels_shared_by_halves": _stability(grid, trials),
+        "levels_shared_by_halves": _stability(grid, trials, shape),
         "packages": {name: version(name) for name in ("numpy", "numba")},
     }
     return _write(output, grid_id, order, scores, metadata)
@@ -185,13 +218,13 @@ def relief(trials: Trials, actions: slice | I32) -> F32:
     return np.where(np.isnan(gained), np.float32(0.0), gained)
 
 
-def rank(trials: Trials, scores: Scores, n_covered: int) -> I32:
+def rank(trials: Trials, scores: Scores, shape: Shape) -> I32:
     """Order actions by the rule in this module's docstring.
 
     Args:
         trials: what was tried; action 0 is do nothing.
         scores: of these trials.
-        n_covered: how many actions are chosen for coverage.
+        shape: of the levels.
 
     Returns:
         Ids, best first, without do nothing, int32 [action - 1].
@@ -200,17 +233,29 @@ def rank(trials: Trials, scores: Scores, n_covered: int) -> I32:
     percent = np.floor(100.0 * rate + 0.5)
     ids = np.arange(1, len(percent), dtype=np.int32)
     ids = ids[np.lexsort((ids, -scores.relief[ids], -percent[ids]))]
-    chosen: list[int] = []
-    left = np.ones(len(trials.base))
+    reserved = shape.reserved[np.lexsort((shape.reserved, -scores.relief[shape.reserved]))]
+    ids = ids[~np.isin(ids, reserved)]
     best = relief(trials, slice(1, None)).max(axis=1)
     counted = (trials.base >= _COVERED) & (best >= _WORTHWHILE)
+    left = _left_after(trials, reserved, best, counted)
+    chosen: list[int] = []
+    n_chosen = max(shape.n_covered - len(reserved), 0)
     for level in np.unique(percent[ids])[::-1]:
-        if len(chosen) >= n_covered:
+        if len(chosen) >= n_chosen:
             break
         equals = ids[percent[ids] == level]
-        chosen += _cover(trials, scores, equals, best, counted, left, n_covered - len(chosen))
-    rest = ids[~np.isin(ids, chosen)]
-    return np.concatenate((np.array(chosen, np.int32), rest)).astype(np.int32)
+        chosen += _cover(trials, scores, equals, best, counted, left, n_chosen - len(chosen))
+    order = np.concatenate((np.array(chosen, np.int32), ids[~np.isin(ids, chosen)]))
+    n_others = shape.n_first - len(reserved)
+    return np.concatenate((order[:n_others], reserved, order[n_others:])).astype(np.int32)
+
+
+def _left_after(trials: Trials, ids: I32, best: F32, counted: Flags) -> F64:
+    """What is left of each operating point after actions were chosen, float64 [point]."""
+    left = np.ones(len(trials.base))
+    share = np.maximum(relief(trials, ids)[counted], 0.0) / best[counted, None]
+    left[counted] = np.prod(1.0 - _TRUST * share, axis=1)
+    return left
 
 
 def _cover(trials: Trials, scores: Scores, ids: I32, best: F32, counted: Flags, left: F64, n_wanted: int) -> list[int]:
@@ -228,13 +273,13 @@ def _cover(trials: Trials, scores: Scores, ids: I32, best: F32, counted: Flags, 
     return chosen
 
 
-def _stability(grid: Grid, trials: Trials) -> dict[str, float]:
+def _stability(grid: Grid, trials: Trials, shape: Shape) -> dict[str, float]:
     """For each level, the share of its actions that two rankings, of every other operating point each, have in common.
 
     The highest level, which holds all actions, is left out.
     """
     halves = [Trials(trials.loadings[k::2], trials.base[k::2]) for k in range(2)]
-    orders = [rank(half, score(half), _n_covered(grid)) for half in halves]
+    orders = [rank(half, score(half), shape) for half in halves]
     return {
         str(size): round(len(set(orders[0][: size - 1]) & set(orders[1][: size - 1])) / (size - 1), 3)
         for size in grid.level_sizes[:-1]
@@ -264,15 +309,19 @@ class _Laboratory:
 
 def _collect(
     laboratory: _Laboratory, states: int, seed: int, folder: Path, progress: Progress
-) -> tuple[list[Snapshot], dict[str, int]]:
-    """Operating points of training episodes, and how many there are of each kind."""
+) -> tuple[list[Snapshot], Play]:
+    """Operating points of training episodes, and what these met."""
     task = progress.add_task("playing episodes", total=states)
     wanted = {kind: round(share * states) for kind, share in _SHARES.items()}
     wanted["stressed"] += states - sum(wanted.values())
     found: dict[str, list[Snapshot]] = {kind: [] for kind in _KINDS}
     spare: dict[str, list[Snapshot]] = {kind: [] for kind in _KINDS}
+    met, tripped = np.zeros((len(_KINDS), 2), np.int64), np.zeros(laboratory.grid.n_line, np.int32)
     for number in range(4 * states):
-        for kind, point in _episode(laboratory, seed, number, folder):
+        episode = _episode(laboratory, seed, number, folder)
+        met += episode.met
+        tripped += episode.tripped
+        for kind, point in zip(episode.kinds, episode.points, strict=True):
             (found if len(found[kind]) < wanted[kind] else spare)[kind].append(point)
         progress.update(task, completed=sum(map(len, found.values())))
         if all(len(found[kind]) == wanted[kind] for kind in _KINDS):
@@ -281,43 +330,108 @@ def _collect(
         missing = states - sum(map(len, found.values()))
         found[kind] += spare[kind][:missing]
     progress.update(task, completed=states)
-    return [point for kind in _KINDS for point in found[kind]], {kind: len(found[kind]) for kind in _KINDS}
+    closable = {
+        kind: [
+            round(float(np.mean([_closable(laboratory.grid, point) for point in found[kind]] or [False])), 3),
+            round(float(met[k, 1] / max(met[k, 0], 1)), 3),
+        ]
+        for k, kind in enumerate(_KINDS)
+    }
+    points = [point for kind in _KINDS for point in found[kind]]
+    return points, Play({kind: len(found[kind]) for kind in _KINDS}, closable, tripped)
 
 
-def _episode(laboratory: _Laboratory, seed: int, number: int, folder: Path) -> list[tuple[str, Snapshot]]:
-    """Operating points of one episode with their kinds, from the saved file if there is one."""
+def _closable(grid: Grid, point: Snapshot) -> bool:
+    """Whether a line is out that may be closed again."""
+    is_out = point.topo_vect[grid.line_or_pos_topo_vect] < 1
+    return bool(np.any(is_out & (point.cooldown_line == 0)))
+
+
+class _Episode(NamedTuple):
+    """What is kept of an episode."""
+
+    kinds: list[str]
+    """Of each of the operating points."""
+    points: list[Snapshot]
+    met: NDArray[np.int64]
+    """[kind, 2] steps of the episode, and those with a line that is out and may be closed."""
+    tripped: I32
+    """[line] how often protections opened it."""
+
+
+def _episode(laboratory: _Laboratory, seed: int, number: int, folder: Path) -> _Episode:
+    """One episode, from the saved file if there is one."""
     file = folder / f"episode_{number:04d}.npz"
     if not file.exists():
-        recorded = list(_play(laboratory, seed, number))
-        arrays = {name: np.array([getattr(point, name) for _, point in recorded]) for name in Snapshot._fields}
-        _save(file, kinds=np.array([kind for kind, _ in recorded], dtype="U8"), **arrays)
+        played = _play(laboratory, seed, number)
+        arrays = {name: np.array([getattr(point, name) for point in played.points]) for name in Snapshot._fields}
+        _save(file, kinds=np.array(played.kinds, dtype="U8"), met=played.met, tripped=played.tripped, **arrays)
     with np.load(file) as arrays:
-        kinds = arrays["kinds"].tolist()
+        kinds, met, tripped = arrays["kinds"].tolist(), arrays["met"], arrays["tripped"]
         columns = [arrays[name] for name in Snapshot._fields]
-    return [(kind, Snapshot(*(column[k] for column in columns))) for k, kind in enumerate(kinds)]
+    return _Episode(kinds, [Snapshot(*(column[k] for column in columns)) for k in range(len(kinds))], met, tripped)
 
 
-def _play(laboratory: _Laboratory, seed: int, number: int) -> Iterator[tuple[str, Snapshot]]:
-    """Play one episode and yield the operating points to keep."""
+def _play(laboratory: _Laboratory, seed: int, number: int) -> _Episode:
+    """Play one episode; of each kind the operating points to keep are drawn from all of its steps."""
     engine, policy = laboratory.engine, _POLICIES[number % len(_POLICIES)]
     plan = plan_episode(
         laboratory.grid, "train", _episode_seed(seed, number // _EPISODES_PER_YEAR), number % _EPISODES_PER_YEAR
     )
-    draws = Stream(seed, number, Purpose.AGENT)
+    draws, choices = Stream(seed, number, Purpose.AGENT), Stream(seed, number, Purpose.START)
     engine.reset(0, plan)
-    kept = dict.fromkeys(_KINDS, 0)
-    last = -_GAP
-    for step in range(min(plan.n_steps, _EPISODE_STEPS)):
-        if engine.state.terminated[0] or engine.state.truncated[0]:
-            return
-        kind = _kind(engine.state)
-        if step >= last + _GAP and kept[kind] < _PER_EPISODE[kind]:
-            kept[kind] += 1
-            last = step
-            yield kind, snapshot_of(engine, 0)
-        if kept["stressed"] == _PER_EPISODE["stressed"]:
-            return
-        engine.step(0, _policy_action(laboratory, policy, kind, draws))
+    state = engine.state
+    kept: dict[str, list[Snapshot]] = {kind: [] for kind in _KINDS}
+    met, tripped = np.zeros((len(_KINDS), 2), np.int64), np.zeros(laboratory.grid.n_line, np.int32)
+    for _ in range(min(plan.n_steps, _EPISODE_STEPS)):
+        if state.terminated[0] or state.truncated[0]:
+            break
+        kind = _kind(state)
+        row = _KINDS.index(kind)
+        closable = np.any(~state.line_status[0] & (state.time_before_cooldown_line[0] == 0))
+        met[row] += 1, closable
+        _draw_one(kept[kind], lambda: snapshot_of(engine, 0), int(met[row, 0]), _PER_EPISODE[kind], choices)
+        before = state.line_status[0].copy()
+        action = _policy_action(laboratory, policy, kind, draws)
+        engine.step(0, action)
+        if not state.terminated[0]:
+            tripped += before & ~state.line_status[0] & ~_opened_otherwise(state, action)
+    kinds = [kind for kind in _KINDS for _ in kept[kind]]
+    return _Episode(kinds, [point for kind in _KINDS for point in kept[kind]], met, tripped)
+
+
+def _draw_one(kept: list[Snapshot], take: Callable[[], Snapshot], number: int, most: int, choices: Stream) -> None:
+    """Keep the ``number``-th of its kind so that in the end each has the same chance to be among at most ``most``."""
+    if len(kept) < most:
+        kept.append(take())
+        return
+    place = choices.integer(number)
+    if place < most:
+        kept[place] = take()
+
+
+def _opened_otherwise(state: Any, action: StepAction) -> Flags:
+    """Lines that are out for another reason than their protections, bool [line]."""
+    opened = state.attacked[0] | (state.time_next_maintenance[0] == 0)
+    opened[[change.target for change in action.changes if change.kind == ActionKind.SWITCH]] = True
+    return np.asarray(opened)
+
+
+def _lines_to_close(grid: Grid, tripped: I32) -> tuple[list[int], dict[str, int]]:
+    """Lines whose switches level 0 holds anyway; and how often protections opened each of the others that they did."""
+    known = {line for area in grid.opponent.areas for line in area}
+    source = draw_scenario(grid.id, TRAIN, 0, 0).partition("/")[0]
+    known |= set(find_system(grid.id).scenarios.maintenance(grid, source).lines)
+    often = [int(line) for line in np.argsort(-tripped, kind="stable") if tripped[line] and line not in known]
+    places = int(_CLOSING_SHARE * (grid.level_sizes[0] - 1))
+    closed = [*sorted(known), *often][: max(places, min(len(known), grid.level_sizes[0] - 1))]
+    return sorted(closed), {str(line): int(tripped[line]) for line in often if line not in closed}
+
+
+def _switches(catalogue: ActionCatalogue, lines: list[int]) -> I32:
+    """Catalogue ids of the switches of lines, int32 [line]."""
+    wanted = (catalogue.kind == ActionKind.SWITCH) & np.isin(catalogue.target, lines)
+    return np.flatnonzero(wanted).astype(np.int32)
 
 
 def _episode_seed(seed: int, block: int) -> int:
