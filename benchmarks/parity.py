@@ -4,7 +4,12 @@
 grids, with probes that look for trouble and with policies trained for the purpose, and writes
 ``benchmarks/results/parity.json``. What was played is kept: an interrupted run goes on where it stopped, and
 a longer one begins with what is there. It fails if the engines disagree without a cause (``docs/parity.md``).
-``--kinds joint`` compares actions of one kind alone; only topology and continuous ones need trained policies.
+``--kinds joint`` compares actions of one kind alone; only topology and continuous ones need trained policies. Of the
+kind ``heuristics`` whole transitions are compared, in the compiled loop of one engine; of the kind ``worlds`` the
+native engine's environments are saved and brought back on the way.
+
+The result counts the steps that one version of the code has played, named by the hash of its sources. Where the result
+is there and its hash is that of the present sources, a run goes on from it, on this machine or another.
 """
 
 from __future__ import annotations
@@ -23,7 +28,7 @@ import time
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -35,15 +40,19 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 import rl2grid
 from rl2grid.algorithms.policy_agent import CHECKPOINT_FILE, load_agent
-from rl2grid.engines.differential import CAUSES, TOLERANCES, SideBySide
+from rl2grid.engines import HEURISTICS
+from rl2grid.engines.differential import CAUSES, TOLERANCES, Detour, SideBySide, TransitionsSideBySide
 from rl2grid.engines.native.engine import NativeEngine
+from rl2grid.engines.native.transitions import NativeTransitions
 from rl2grid.engines.probes import KINDS, PROBES, Probe, make_probe
 from rl2grid.engines.reference.engine import ReferenceEngine
+from rl2grid.engines.transition import Transitions
 from rl2grid.envs.description import single_spaces
 from rl2grid.envs.tasks import find_task
 from rl2grid.grids import GRID_IDS, Grid, load_grid
 from rl2grid.mdp.actions import StepAction, inject, legal_actions, level_catalogue
 from rl2grid.mdp.features import observation_size, observation_writer, physical_scale
+from rl2grid.mdp.rewards import PRESETS
 from rl2grid.mdp.state import GridState
 from rl2grid.records.files import write_text
 from rl2grid.records.versions import library_versions
@@ -59,6 +68,9 @@ TRAINED = "trained"
 TRAINING_DECISIONS = 4096
 _EPISODES_OF_A_PART = 1_000_000
 _TASKS = {"topology": "T0", "continuous": "R"}
+HEURISTIC_KIND, WORLDS_KIND = "heuristics", "worlds"
+ALL_KINDS = (*KINDS, HEURISTIC_KIND, WORLDS_KIND)
+GAMMA = 0.99
 
 
 @dataclass(frozen=True)
@@ -67,10 +79,10 @@ class Cell:
 
     grid: str
     kind: str
-    """One of :data:`rl2grid.engines.probes.KINDS`."""
+    """One of :data:`ALL_KINDS`."""
     dispatch: str
     policy: str
-    """A probe, or ``trained``."""
+    """A probe, or ``trained``; with heuristics, the heuristic and the kind of a probe."""
 
 
 @dataclass(frozen=True)
@@ -122,14 +134,23 @@ class TrainedProbe:
 def cells_of(grids: Iterable[str], kinds: Iterable[str]) -> list[Cell]:
     """Everything to be compared; topology actions alone do not meet the dispatch."""
     both = ("exact", "grid2op")
-    dispatches = {"topology": ("exact",), "continuous": both, "mixed": both, "joint": both}
+    dispatches = {"continuous": both, "mixed": both, "joint": both}
     return [
         Cell(grid, kind, dispatch, policy)
         for grid in grids
         for kind in kinds
-        for dispatch in dispatches[kind]
-        for policy in (*PROBES[kind], *((TRAINED,) if kind in _TASKS else ()))
+        for dispatch in dispatches.get(kind, ("exact",))
+        for policy in policies_of(kind)
     ]
+
+
+def policies_of(kind: str) -> list[str]:
+    """What is played of a kind."""
+    if kind == HEURISTIC_KIND:
+        return [f"{heuristic} {actions}" for heuristic in HEURISTICS for actions in _TASKS]
+    if kind == WORLDS_KIND:
+        return ["mixed", "joint"]
+    return [*PROBES[kind], *((TRAINED,) if kind in _TASKS else ())]
 
 
 def parts_of(cells: list[Cell], steps: int) -> Iterator[Part]:
@@ -164,21 +185,38 @@ def probe_of(grid_id: str, kind: str, policy: str, policies: Path) -> Probe:
     grid = load_grid(grid_id)
     if policy == TRAINED:
         return TrainedProbe(grid, kind, policies / f"{grid_id}-{_TASKS[kind]}")
+    if kind == HEURISTIC_KIND:
+        return make_probe(grid, policy.partition(" ")[2], "random")
+    if kind == WORLDS_KIND:
+        return make_probe(grid, policy, "adversarial")
     return make_probe(grid, kind, policy)
+
+
+def side_by_side(cell: Cell) -> SideBySide:
+    """What plays a cell on both engines."""
+    reference, native = engines(cell.grid, cell.dispatch)
+    if cell.kind == HEURISTIC_KIND:
+        heuristic, _, actions = cell.policy.partition(" ")
+        setting = heuristic, actions == "topology", PRESETS["default"], GAMMA
+        return TransitionsSideBySide(Transitions(reference, *setting), NativeTransitions(native, *setting))
+    if cell.kind == WORLDS_KIND:
+        return SideBySide(reference, Detour(native, make_probe(native.grid, "mixed", "random")))
+    return SideBySide(reference, native, dispatch=cell.dispatch)
 
 
 def compare(part: Part, seed: int, policies: Path) -> dict[str, Any]:
     """Play one part; returns its record."""
-    cell, began = part.cell, time.perf_counter()
-    reference, native = engines(cell.grid, cell.dispatch)
-    pair = SideBySide(reference, native, dispatch=cell.dispatch)
+    cell = part.cell
+    pair, grid = side_by_side(cell), load_grid(cell.grid)
     probe, number = probe_of(cell.grid, cell.kind, cell.policy, policies), part.number * _EPISODES_OF_A_PART
     while pair.tally.steps < part.steps:
-        pair.play(plan(native.grid, seed, number), probe, part.steps - pair.tally.steps)
+        pair.play(plan(grid, seed, number), probe, part.steps - pair.tally.steps)
         number += 1
     tally = pair.tally
     return {
-        **asdict(part),
+        "cell": asdict(cell),
+        "numbers": [part.number],
+        "part_steps": part.steps,
         "compared": tally.steps,
         "simulations": tally.simulations,
         "episodes": tally.episodes,
@@ -187,7 +225,6 @@ def compare(part: Part, seed: int, policies: Path) -> dict[str, Any]:
         "counts": dict(tally.counts),
         "largest": tally.largest,
         "disagreements": [{"cause": each.cause, "what": str(each)} for each in tally.disagreements],
-        "seconds": time.perf_counter() - began,
     }
 
 
@@ -214,33 +251,73 @@ def train_policies(cells: Iterable[Cell], folder: Path) -> None:
 def source_hash() -> str:
     """Short hash of what plays and compares: parts played with other code do not count."""
     digest, root = hashlib.sha256(), Path(rl2grid.__file__).parent
-    below = ("compile.py", "handles.py", "engines", "mdp", "powerflow", "grids")
+    below = ("compile.py", "handles.py", "structures.py", "engines", "mdp", "powerflow", "grids")
     for path in sorted(path for path in root.rglob("*") if path.relative_to(root).parts[0] in below):
-        if path.suffix in (".py", ".json", ".npz"):
+        if path.suffix in (".py", ".json"):  # rankings, .npz, play no step
             digest.update(f"{path.relative_to(root).as_posix()}\n".encode())
             digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 
 
 class Store:
-    """The records of the parts played, one JSON line each."""
+    """What was played: the records of parts, one JSON line each, behind those that an earlier result adds up.
 
-    def __init__(self, path: Path) -> None:
+    Args:
+        path: of the lines.
+        result: an earlier result; None where there is none of these sources and this seed.
+    """
+
+    def __init__(self, path: Path, result: dict[str, Any] | None) -> None:
         self._path = path
         path.parent.mkdir(parents=True, exist_ok=True)
         lines = path.read_text().splitlines() if path.exists() else []
-        self.records = [json.loads(line) for line in lines if line.endswith("}")]  # the last one may be cut off
+        self.records = [] if result is None else [_record_of(row, result) for row in result["cells"] if row["numbers"]]
+        self._played = {key for record in self.records for key in _keys(record)}
+        for line in lines:
+            record = json.loads(line) if line.endswith("}") else None  # the last one may be cut off
+            if record is not None and not self._played.issuperset(_keys(record)):
+                self._keep(record)
 
     def add(self, record: dict[str, Any]) -> None:
         """Keep a record."""
-        self.records.append(record)
+        self._keep(record)
         with self._path.open("a") as file:
             file.write(json.dumps(record) + "\n")
 
     def has(self, part: Part) -> bool:
         """Whether the part was played."""
-        wanted = asdict(part)
-        return any(all(record[key] == value for key, value in wanted.items()) for record in self.records)
+        return (part.cell, part.number, part.steps) in self._played
+
+    def _keep(self, record: dict[str, Any]) -> None:
+        self.records.append(record)
+        self._played.update(_keys(record))
+
+
+def _keys(record: dict[str, Any]) -> list[tuple[Cell, int, int]]:
+    """What tells the parts of a record from others."""
+    return [(Cell(**record["cell"]), number, record["part_steps"]) for number in record["numbers"]]
+
+
+def _record_of(row: dict[str, Any], result: dict[str, Any]) -> dict[str, Any]:
+    """The parts of a cell, as a result adds them up, as one record."""
+    cell = {field.name: row[field.name] for field in fields(Cell)}
+    mine = [each for each in result["disagreements"] if all(each[key] == value for key, value in cell.items())]
+    return {
+        **{key: row[key] for key in ("numbers", "part_steps", "simulations", "episodes", "completed", "game_overs")},
+        "cell": cell,
+        "compared": row["steps"],
+        "counts": row["steps_with"],
+        "largest": row["largest"],
+        "disagreements": [{"cause": each["cause"], "what": each["what"]} for each in mine],
+    }
+
+
+def earlier_result(path: Path, source: str, seed: int) -> dict[str, Any] | None:
+    """The result in a file, if it is of these sources and this seed."""
+    if not path.exists():
+        return None
+    result: dict[str, Any] = json.loads(path.read_text())
+    return result if result["hashes"]["source"] == source and result["seed"] == seed else None
 
 
 def play_parts(parts: list[Part], store: Store, seed: int, policies: Path, deadline: float, processes: int) -> None:
@@ -334,7 +411,17 @@ def _cell_summary(cell: Cell, records: list[dict[str, Any]]) -> dict[str, Any]:
         )
         game_overs.update(record["game_overs"])
         counts.update(record["counts"])
-    return {**asdict(cell), **totals, "game_overs": dict(sorted(game_overs.items())), "steps_with": dict(counts)}
+    return {
+        **asdict(cell),
+        "numbers": sorted(number for record in mine for number in record["numbers"]),
+        "part_steps": mine[0]["part_steps"] if mine else 0,
+        **{
+            name: totals[name] for name in ("steps", "simulations", "episodes", "completed", "explained", "unexplained")
+        },
+        "game_overs": dict(sorted(game_overs.items())),
+        "steps_with": dict(counts),
+        "largest": _largest(mine),
+    }
 
 
 def write(result: dict[str, Any], path: Path) -> None:
@@ -355,7 +442,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--steps", type=int, default=1_000_000, help="grid steps to compare, over all grids")
     parser.add_argument("--grids", nargs="+", default=list(GRID_IDS), choices=GRID_IDS)
-    parser.add_argument("--kinds", nargs="+", default=list(KINDS), choices=KINDS, help="kinds of actions to compare")
+    parser.add_argument(
+        "--kinds", nargs="+", default=list(ALL_KINDS), choices=ALL_KINDS, help="kinds of actions to compare"
+    )
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--minutes", type=float, default=math.inf, help="begin no part after this time")
     parser.add_argument("--seed", type=int, default=0)
@@ -369,7 +458,8 @@ def main() -> int:
     train_policies(cells, folder / "policies")
     parts = list(parts_of(cells, arguments.steps))
     source = source_hash()  # now: the code may be edited while it is compared
-    store = Store(folder / f"{source}-{arguments.seed}.jsonl")
+    earlier = earlier_result(arguments.output, source, arguments.seed)
+    store = Store(folder / f"{source}-{arguments.seed}.jsonl", earlier)
     play_parts(parts, store, arguments.seed, folder / "policies", deadline, arguments.processes)
     command = shlex.join(["python", "benchmarks/parity.py", *sys.argv[1:]])
     result = summary(store.records, cells, arguments.seed, source, folder / "policies", command)

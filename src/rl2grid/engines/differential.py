@@ -19,9 +19,12 @@ from numpy.typing import NDArray
 from rl2grid.compile import jit
 from rl2grid.engines.base import Engine
 from rl2grid.engines.probes import Probe
+from rl2grid.engines.transition import Transitions
+from rl2grid.engines.worlds import World
 from rl2grid.grids import Grid
 from rl2grid.mdp.accumulate import accrue, begin_episode
 from rl2grid.mdp.actions import ActionKind, StepAction
+from rl2grid.mdp.heuristics import SAFE_RHO
 from rl2grid.mdp.rewards import PRESETS, RewardFunction
 from rl2grid.mdp.state import OBSERVED, OBSERVED_STORAGE, GridState
 from rl2grid.mdp.termination import GameOver
@@ -47,6 +50,14 @@ COMPARED: tuple[str, ...] = (
 )
 """What is compared after every step; sums hold that step alone. ``final_topo_vect`` joins them at a game over
 that a power flow decided: without a feasible dispatch none is run, and it has no meaning."""
+
+_COUNTED = ("n_steps", "decisions", "reset_steps", "open_since", "split_since")
+_SUMMED = (
+    *("transition_reward", "transition_discounted", "transition_components", "transition_costs"),
+    *("reset_reward", "reset_components", "reset_costs", "episode_return", "episode_costs", "episode_scores"),
+)
+"""Compared from decision to decision: what counts steps, and what adds up over them."""
+_NOT_SUMMED = tuple(name for name in COMPARED if name not in _SUMMED)
 
 _POWER_OR_CURRENT, _SHARE, _DEGREES = 1e-4, 1e-5, 1e-4
 TOLERANCES: dict[str, float] = {
@@ -174,6 +185,7 @@ class SideBySide:
         self._dispatch, self._reward, self._simulate_every = dispatch, reward, simulate_every
         self._comparison = _Comparison(expected.state, actual.state)
         self._counts = np.zeros(len(COUNTS), np.int64)
+        self._limits: tuple[float, ...] = (1.0, float(self._grid.rules.hard_overflow))
 
     def play(self, plan: EpisodePlan, probe: Probe, most_steps: int | None = None) -> int:
         """Play an episode to its end, to the first disagreement, or for ``most_steps`` steps.
@@ -265,7 +277,7 @@ class SideBySide:
         expected, actual = comparison.expected, comparison.actual
         if "attacked" in attributes and self.ranks_differ(before):
             return OPPONENT_RANK, "the order of the last loadings differs"
-        near = [near_threshold(self._grid, rho) for rho in (*before, expected.rho[0], actual.rho[j])]
+        near = [near_threshold(self._limits, rho) for rho in (*before, expected.rho[0], actual.rho[j])]
         if any(near):
             return THRESHOLD, next(each for each in near if each)
         reasons = (int(expected.game_over[0]), int(actual.game_over[j]))
@@ -297,9 +309,108 @@ class SideBySide:
         tally.largest = self._comparison.largest_by_attribute()
 
 
-def near_threshold(grid: Grid, rho: NDArray[np.float32]) -> str:
-    """Which line of ``rho`` [line] is loaded within 1e-5 of a limit, in words; empty if none is."""
-    for threshold in (1.0, float(grid.rules.hard_overflow)):
+class TransitionsSideBySide(SideBySide):
+    """As :class:`SideBySide`, but the engines are compared from decision to decision: a heuristic plays between.
+
+    The heuristic decides on each engine's own state, and in the compiled loop of the engine that has one. Nothing is
+    simulated but what the heuristic tries.
+    """
+
+    def __init__(self, expected: Transitions, actual: Transitions) -> None:
+        super().__init__(expected.engine, actual.engine, reward=expected.reward, simulate_every=0)
+        self._transitions = expected, actual
+        self._comparison = _Comparison(expected.engine.state, actual.engine.state, compared=_NOT_SUMMED)
+        self._limits = (float(SAFE_RHO), *self._limits)
+
+    def _play(self, probe: Probe, most_steps: int) -> int:
+        i, j, state = 0, self._row, self._expected.state
+        before = np.zeros((2, self._grid.n_line), np.float32)
+        for transitions, row in zip(self._transitions, (i, j), strict=True):
+            transitions.reset(row, self._plan)
+        if self._disagree("reset", before):
+            return 0
+        while state.step[i] < most_steps and not (state.terminated[i] or state.truncated[i]):
+            before[0], before[1] = state.rho[i], self._actual.state.rho[j]
+            action = probe.choose(state, i)
+            for transitions, row in zip(self._transitions, (i, j), strict=True):
+                transitions.play(row, action)
+            _count(state, i, self._counts)
+            if self._disagree(_in_short(action), before):
+                break
+        return int(state.step[i])
+
+    def _disagree(self, action: str, before: NDArray[np.float32]) -> bool:
+        if not (self._comparison.find(0, self._row) or self._sums_differ()):
+            return False
+        self._note(self._comparison, self._row, action, 0, before)
+        return True
+
+    def _sums_differ(self) -> bool:
+        """Whether what adds up over the steps of a transition differs by more than its steps may."""
+        (expected, actual), j = (self._expected.state, self._actual.state), self._row
+        tolerance = _SHARE * max(int(expected.step[0]), 1)
+        pairs = {name: (getattr(expected, name)[0], getattr(actual, name)[j]) for name in (*_COUNTED, *_SUMMED)}
+        return not (
+            all(np.array_equal(*pairs[name]) for name in _COUNTED)
+            and all(np.allclose(*pairs[name], rtol=0, atol=tolerance) for name in _SUMMED)
+        )
+
+
+class Detour:
+    """An engine whose environments are saved now and then, play something else, and are brought back.
+
+    It must then be the engine that it wraps: a world holds everything.
+    """
+
+    def __init__(self, engine: Engine, probe: Probe, every: int = 20, steps: int = 3) -> None:
+        self._engine, self._probe, self._every, self._steps = engine, probe, every, steps
+        self.grid, self.state = engine.grid, engine.state
+        self._played = 0
+
+    def reset(self, i: int, plan: EpisodePlan) -> None:
+        """Begin the episode ``plan`` in environment ``i``."""
+        self._probe.begin(np.random.default_rng((plan.seed, plan.number, 2)))
+        self._engine.reset(i, plan)
+        self.state = self._engine.state
+
+    def step(self, i: int, action: StepAction) -> None:
+        """Play one grid step of environment ``i``, and now and then a few others that are taken back."""
+        self._engine.step(i, action)
+        self._played += 1
+        if self._played % self._every or self.state.terminated[i] or self.state.truncated[i]:
+            return
+        world = self._engine.save(i)
+        for _ in range(self._steps):
+            if not (self.state.terminated[i] or self.state.truncated[i]):
+                self._engine.step(i, self._probe.choose(self.state, i))
+        other = (i + 1) % self.state.step.shape[0]
+        self._engine.restore(other, world)
+        self._engine.restore(i, self._engine.save(other))
+
+    def simulate(self, i: int, action: StepAction, horizon: int) -> GridState:
+        """See :meth:`rl2grid.engines.base.Engine.simulate`."""
+        return self._engine.simulate(i, action, horizon)
+
+    def save(self, i: int) -> World:
+        """See :meth:`rl2grid.engines.base.Engine.save`."""
+        return self._engine.save(i)
+
+    def restore(self, i: int, world: World) -> None:
+        """See :meth:`rl2grid.engines.base.Engine.restore`."""
+        self._engine.restore(i, world)
+
+    def imagine(self, i: int, seed: int) -> World:
+        """See :meth:`rl2grid.engines.base.Engine.imagine`."""
+        return self._engine.imagine(i, seed)
+
+    def close(self) -> None:
+        """Free what the engine holds."""
+        self._engine.close()
+
+
+def near_threshold(limits: tuple[float, ...], rho: NDArray[np.float32]) -> str:
+    """Which line of ``rho`` [line] is loaded within 1e-5 of one of ``limits``, in words; empty if none is."""
+    for threshold in limits:
         lines = np.flatnonzero(np.abs(rho.astype(np.float64) - threshold) < _NEAR)
         if len(lines):
             return f"line {lines[0]} is loaded {rho[lines[0]]:.8f}"
@@ -309,14 +420,16 @@ def near_threshold(grid: Grid, rho: NDArray[np.float32]) -> str:
 class _Comparison:
     """Which values of a row of one state differ from those of a row of another."""
 
-    def __init__(self, expected: GridState, actual: GridState) -> None:
+    def __init__(self, expected: GridState, actual: GridState, *, compared: tuple[str, ...] = COMPARED) -> None:
         self.expected, self.actual = expected, actual
         self._names: list[tuple[str, ...]] = []
         self._pairs: list[tuple[Arrays, Arrays]] = []
         self._limits: list[NDArray[np.float64]] = []
         self._largest: list[NDArray[np.float64]] = []
         for dtype in (np.float32, np.float64, np.int32, np.bool_):
-            names = tuple(name for name in COMPARED if getattr(expected, name).dtype == dtype)
+            names = tuple(name for name in compared if getattr(expected, name).dtype == dtype)
+            if not names:
+                continue
             resolution = _FLOAT32_RESOLUTION if dtype == np.float32 else 0.0
             self._names.append(names)
             self._pairs.append((_as_rows(expected, names), _as_rows(actual, names)))
@@ -325,14 +438,10 @@ class _Comparison:
 
     def find(self, i: int, j: int) -> bool:
         """Whether row ``i`` of the expected state and row ``j`` of the actual one differ too much."""
-        (floats, doubles, integers, flags), limits, largest = self._pairs, self._limits, self._largest
-        return bool(
-            _differ(*floats, i, j, limits[0], largest[0])
-            | _differ(*doubles, i, j, limits[1], largest[1])
-            | _differ(*integers, i, j, limits[2], largest[2])
-            | _differ(*flags, i, j, limits[3], largest[3])
-            | self._final_topologies_differ(i, j)
-        )
+        found = self._final_topologies_differ(i, j)
+        for pair, limits, largest in zip(self._pairs, self._limits, self._largest, strict=True):
+            found |= _differ(*pair, i, j, limits, largest)
+        return bool(found)
 
     def differences(self, i: int, j: int) -> Iterator[Difference]:
         """All values that differ too much."""
