@@ -13,7 +13,6 @@ from rl2grid.analysis.action_space import (
     substation_shares,
     switches_held,
     topology_after,
-    wilson_interval,
 )
 from rl2grid.errors import UsageError
 from rl2grid.grids import load_grid
@@ -32,16 +31,6 @@ def arrays(tmp_path, monkeypatch):
     made_up["trials"][9] = made_up["survived"][9] = 0
     use_ranking(monkeypatch, tmp_path, "bus14", made_up)
     return made_up
-
-
-def test_wilsons_interval_is_the_textbooks():
-    # Brown, Cai and DasGupta (2001): bounds p with |k/n - p| = z sqrt(p (1 - p) / n); first two worked by hand.
-    low, high = wilson_interval([8, 0, 10, 0], [10, 10, 10, 0])
-    np.testing.assert_allclose(low, [0.4902, 0.0, 0.7225, 0.0], atol=5e-5)
-    np.testing.assert_allclose(high, [0.9433, 0.2775, 1.0, 1.0], atol=5e-5)
-    k, n = np.array([3, 77, 950]), np.array([11, 100, 1000])
-    for bound in wilson_interval(k, n):
-        np.testing.assert_allclose(np.abs(k / n - bound), 1.959964 * np.sqrt(bound * (1 - bound) / n), rtol=1e-6)
 
 
 @pytest.mark.parametrize("level", [0, ALL])

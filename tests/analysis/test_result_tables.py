@@ -9,11 +9,12 @@ import re
 import pytest
 from sample_results import TASK, result
 
+from rl2grid.analysis.comparison_table import comparison_table, reference_table
 from rl2grid.analysis.result_tables import (
     aggregate_table,
-    comparison_table,
     constraint_table,
     ending_table,
+    ranking_table,
     result_tables,
     score_table,
     survival_table,
@@ -57,9 +58,9 @@ def test_survival_has_the_shape_of_the_paper():
         ("ppo", "V"),
         ("ppo", "R"),
     ]
-    assert texts(table.rows[0]) == ["bus14", "0", "0.15 ± 0.05", "0.40 ± 0.10", "0.95 ± 0.05"]
+    assert texts(table.rows[0]) == ["bus14", "0", "0.15 ± 0.10", "0.40 ± 0.18", "0.95 ± 0.11"]
     assert [cell.best for cell in table.rows[0]] == [False, False, False, False, True]
-    assert texts(table.rows[1]) == ["bus36-M", "1", MISSING.text, MISSING.text, "0.30 ± 0.10"]
+    assert texts(table.rows[1]) == ["bus36-M", "1", MISSING.text, MISSING.text, "0.30 ± 0.18"]
     assert not table.rows[1][-1].best  # alone
     continuous = survival_table(METHODS, "R")
     assert [column.heading for column in continuous.columns[2:]] == ["do-nothing", "V"]
@@ -76,9 +77,9 @@ def test_the_least_gap_is_best():
 
 def test_constraints_scores_and_endings():
     (row, *_) = constraint_table(METHODS).rows
-    assert texts(row)[:5] == ["bus14-T0", "ppo + recovery", "0.95 ± 0.05", "0.5 ± 0.5", "0.50 ± 0.50"]
-    assert row[7].text == "1.00 ± 0.00"  # TLO is kept by both,
-    assert row[8].text == "0.50 ± 0.50"  # one of which was completed
+    assert texts(row)[:5] == ["bus14-T0", "ppo + recovery", "0.95 ± 0.11", "0.5 ± 2.6", "0.50 ± 0.41"]
+    assert row[7].text == "1.00 ± 0.33"  # TLO is kept by both,
+    assert row[8].text == "0.50 ± 0.41"  # one of which was completed
     assert row[8].best
     assert texts(score_table(METHODS).rows[0])[2:] == ["11.000 ± 0.000", "-0.250 ± 0.000", "-2.000 ± 0.000"]
     endings = ending_table(METHODS)
@@ -94,8 +95,24 @@ def test_every_pair_is_compared():
         ["ppo + recovery", "do-nothing"],
         ["ppo", "do-nothing"],
     ]
-    assert rows[0][3] == "1.000 [1.000, 1.000]"
-    assert rows[2][4:6] == ["30", "10"]
+    assert rows[0][3:6] == ["+0.550 [+0.086, +1.000]", "0.115", "1.000 [0.342, 1.000]"]
+    assert rows[2][6:8] == ["30", "10"]
+
+
+def test_a_ranking_compares_with_its_first_row():
+    table = ranking_table(METHODS[TASK])
+    assert texts(table.rows[0])[:5] == ["ppo + recovery", "0.950 [0.764, 0.991]", "-", "-", "50% [9, 91]"]
+    assert texts(table.rows[1])[:5] == ["ppo", "0.400 [0.234, 0.593]", "-0.550 [-1.000, -0.086]", "0.115", "0% [0, 66]"]
+    assert [row[-4].text for row in table.rows] == ["1", "1", MISSING.text]
+    assert "over months alone for the one training run of ppo + recovery, ppo, which says nothing" in table.caption
+
+
+def test_methods_are_compared_with_one_of_them():
+    table = reference_table(METHODS[TASK], reference=2)
+    assert [row[0].text for row in table.rows] == ["ppo + recovery", "ppo"]
+    assert table.rows[1][1].text == "+0.250 [-0.214, +0.714]"
+    assert table.rows[1][2].text == "0.126"
+    assert "Holm's correction over these 2 comparisons" in table.caption
 
 
 def test_nothing_to_compare_is_no_table():

@@ -17,7 +17,7 @@ from rl2grid.drawing.theme import DARK
 from rl2grid.errors import UsageError
 from rl2grid.grids import load_grid
 from rl2grid.records.methods import group_methods
-from rl2grid.records.statistics import bootstrap_band, episode_mean
+from rl2grid.records.statistics import curve_band, episode_mean
 from rl2grid.records.trainings import TrainingRun
 
 RESULTS = [
@@ -94,7 +94,7 @@ def test_training_is_smoothed_over_episodes_with_a_band_over_runs():
         metric = run.metrics["charts/cost_tlo"]
         values = episode_mean(metric.values, metric.episodes, SMOOTHED_EPISODES)
         smoothed.append(np.interp(line.get_xdata(), metric.decisions, values))
-    average, low, high = bootstrap_band(smoothed)
+    average, low, high = curve_band(smoothed)
     np.testing.assert_allclose(line.get_ydata(), average)
     corners = axes.collections[0].get_paths()[0].vertices[:, 1]
     assert corners.min() == pytest.approx(low.min())

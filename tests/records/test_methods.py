@@ -10,8 +10,7 @@ from sample_results import TASK, result
 
 from rl2grid.errors import UsageError
 from rl2grid.records.evaluations import Evaluation
-from rl2grid.records.methods import group_methods, resampled_units
-from rl2grid.records.statistics import Unit
+from rl2grid.records.methods import group_methods, interval_units, interval_words
 from rl2grid.records.trainings import group_curves, read_training_run
 
 OTHER_TASK = "rl2grid/bus36-MO-v0-T0-v0"
@@ -25,11 +24,25 @@ def test_runs_of_one_agent_are_one_method():
     assert [method.label for method in methods] == ["ppo + idle", "ppo"]
     scores = methods[0].scores("survival")
     np.testing.assert_array_equal(scores.values, [[[1.0, 0.5], [0.2, 0.4]], [[0.1, 0.3], [0.6, 0.8]]])
-    np.testing.assert_array_equal(scores.by_scenario, [[1.0, 0.5, 0.1, 0.3], [0.2, 0.4, 0.6, 0.8]])
-    assert scores.unit is Unit.RUN
+    assert (scores.runs, scores.months, scores.bounds) == (2, 2, (0.0, 1.0))
     assert methods[0].scenarios == ("scenario 0", "scenario 1")
     assert methods[0].is_trained
-    assert resampled_units(methods) == "training runs, else seeds within scenarios"
+    assert interval_units(methods) == "training runs and months, of one run over months alone"
+    assert interval_words(methods) == (
+        "95% intervals over training runs and months, crossed; over months alone for the one training run of ppo, "
+        "which says nothing of other trainings"
+    )
+
+
+def test_intervals_say_where_nothing_was_trained():
+    plain = group_methods([result("a", [[1.0]]), result("b", [[1.0]])])[TASK]
+    assert interval_words(plain) == "95% intervals over months, as nothing was trained"
+    both = group_methods([result("a", [[1.0]]), result("ppo", [[1.0]], agent_hash="p")])[TASK]
+    assert interval_words(both) == (
+        "95% intervals over months alone where nothing was trained; over months alone for the one training run of ppo, "
+        "which says nothing of other trainings"
+    )
+    assert interval_units(both) == "months alone"
 
 
 def test_dying_early_is_cheap_but_not_safe():
@@ -48,7 +61,7 @@ def trained(seeds: tuple[int, int] = (1, 2), algorithms: tuple[str, str] = ("ppo
 
 def test_trainings_with_other_seeds_are_one_method():
     (method,) = group_methods(trained())[TASK]
-    assert method.scores("survival").unit is Unit.RUN
+    assert method.scores("survival").runs == 2
 
 
 @pytest.mark.parametrize(

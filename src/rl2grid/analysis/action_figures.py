@@ -24,7 +24,6 @@ from rl2grid.analysis.action_space import (
     substation_shares,
     switches_held,
     topology_after,
-    wilson_interval,
 )
 from rl2grid.arrays import F64
 from rl2grid.drawing.grid_drawing import GridDrawing, add_legend, reference_scene
@@ -34,6 +33,7 @@ from rl2grid.grids import Grid
 from rl2grid.grids.ranking import Trials
 from rl2grid.grids.rankings import ranking, trials
 from rl2grid.mdp.actions import ActionKind, StepAction, describe
+from rl2grid.records.shares import wilson_interval
 
 MAX_POINTS = 600
 """Columns of a curve over actions: more actions are pooled."""

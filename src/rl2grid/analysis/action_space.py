@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from statistics import NormalDist
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from rl2grid.arrays import F64
 from rl2grid.errors import UsageError
 from rl2grid.grids import STEPS_PER_HOUR, Grid, find_system
 from rl2grid.grids.ranking import Trials
@@ -26,24 +24,9 @@ from rl2grid.mdp.actions import (
     level_ids,
     moved_elements,
 )
-from rl2grid.records.statistics import LEVEL
+from rl2grid.records.shares import wilson_interval
 
 MINUTES_PER_STEP = 60 // STEPS_PER_HOUR
-
-
-def wilson_interval(successes: ArrayLike, attempts: ArrayLike, *, level: float = LEVEL) -> tuple[F64, F64]:
-    """Wilson's score interval of a probability, float64 low and high.
-
-    Unlike the normal interval it never leaves [0, 1] and has a width where all attempts went the same way.
-    Without any attempt it is [0, 1].
-    """
-    n = np.asarray(attempts, np.float64)
-    k = np.asarray(successes, np.float64)
-    z = NormalDist().inv_cdf((1 + level) / 2)
-    centre = (k + z**2 / 2) / (n + z**2)
-    half = z / (n + z**2) * np.sqrt(np.where(n > 0, k * (n - k) / np.maximum(n, 1), 0.0) + z**2 / 4)
-    # At the ends the exact bound is 0 or 1; rounding would miss it by an ulp.
-    return np.where(k == 0, 0.0, centre - half), np.where(k == n, 1.0, centre + half)
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,9 @@ from rl2grid.analysis.result_tables import AGGREGATES
 from rl2grid.drawing.theme import BLUE, LIGHT, VERMILLION, Theme, style
 from rl2grid.engines import HEURISTICS
 from rl2grid.mdp.constraint_table import THRESHOLDS
-from rl2grid.records.methods import COSTS, Method, resampled_units
-from rl2grid.records.statistics import Estimate, estimate, probability_of_improvement, score_band, share_above
+from rl2grid.records.comparisons import probability_of_improvement
+from rl2grid.records.methods import COSTS, Method, interval_units
+from rl2grid.records.statistics import Estimate, estimate, profile_band
 
 THRESHOLDS_DRAWN = 201
 """Points of a performance profile."""
@@ -35,7 +36,7 @@ def draw_profiles(methods: Sequence[Method], *, theme: Theme = LIGHT) -> Figure:
     with matplotlib.rc_context(style(theme)):
         figure, axes = _figure()
         for method, colour, dashes in _looks(methods, theme):
-            share, low, high = score_band(method.scores("survival"), share_above(levels))
+            share, low, high = profile_band(method.scores("survival"), levels)
             # Nothing is longer than a completed episode: the last point would always be 0.
             shown = slice(0, -1)
             axes.fill_between(levels[shown], low[shown], high[shown], color=colour, alpha=_band(methods), linewidth=0)
@@ -44,7 +45,7 @@ def draw_profiles(methods: Sequence[Method], *, theme: Theme = LIGHT) -> Figure:
         _percent(axes.xaxis, axes.yaxis)
         axes.grid()
         _legend(figure)
-        sentence = f"band: 95% interval over {resampled_units(methods)}"
+        sentence = f"band: 95% interval over {interval_units(methods)}"
         figures._headline(axes, _title("Performance profiles", methods), sentence)
     return figure
 
@@ -60,8 +61,7 @@ def draw_aggregates(methods: Sequence[Method], *, theme: Theme = LIGHT) -> Figur
             axes.set_xlabel(f"{name[0].upper()}{name[1:]}")
             axes.xaxis.set_major_formatter(PercentFormatter(1.0, symbol=""))
         _name_rows(panels[0], methods)
-        units = resampled_units(methods)
-        sentence = f"95% interval over {units}; gap: less is better"
+        sentence = f"95% interval over {interval_units(methods)}; gap: less is better"
         figures.headline_of_panels(figure, _title("Survival in %", methods), sentence)
     return figure
 
@@ -96,7 +96,7 @@ def draw_improvements(methods: Sequence[Method], *, theme: Theme = LIGHT) -> Fig
 
 def draw_two_methods(x: Method, y: Method, *, theme: Theme = LIGHT) -> Figure:
     """Two methods month by month: one dot per scenario, means over its repetitions."""
-    a, b = (method.scores("survival").by_scenario.mean(axis=1) for method in (x, y))
+    a, b = (method.scores("survival").by_month for method in (x, y))
     with matplotlib.rc_context(style(theme)):
         figure = Figure(figsize=(4.4, 4.5), layout="constrained")
         axes = figure.subplots()
@@ -130,7 +130,7 @@ def draw_two_methods(x: Method, y: Method, *, theme: Theme = LIGHT) -> Figure:
 
 def draw_scenarios(methods: Sequence[Method], *, theme: Theme = LIGHT) -> Figure:
     """Survival of every method in every month: the hardest months on the left, the best method on top."""
-    survival = np.stack([method.scores("survival").by_scenario.mean(axis=1) for method in methods])
+    survival = np.stack([method.scores("survival").by_month for method in methods])
     rows, columns = np.argsort(-survival.mean(axis=1), kind="stable"), np.argsort(survival.mean(axis=0), kind="stable")
     names = [methods[0].scenarios[column] for column in columns]
     with matplotlib.rc_context(style(theme)):
@@ -158,7 +158,7 @@ def draw_lifetimes(methods: Sequence[Method], *, theme: Theme = LIGHT) -> Figure
         figure, axes = _figure()
         end = max(episode.episode_length for method in methods for episode in method.episodes) / STEPS_PER_DAY
         for method, colour, dashes in _looks(methods, theme):
-            curve = kaplan_meier(lifetimes(method.episodes))
+            curve = kaplan_meier(lifetimes([result.episodes for result in method.evaluations]))
             days = np.append(curve.steps / STEPS_PER_DAY, end)
             alive, low, high = (np.append(values, values[-1]) for values in (curve.alive, curve.low, curve.high))
             axes.fill_between(days, low, high, step="post", color=colour, alpha=_band(methods), linewidth=0)
@@ -169,7 +169,7 @@ def draw_lifetimes(methods: Sequence[Method], *, theme: Theme = LIGHT) -> Figure
         _percent(axes.yaxis)
         axes.grid()
         _legend(figure)
-        sentence = "Kaplan-Meier with 95% Greenwood bands; tick at the end: completed episodes, censored"
+        sentence = f"Kaplan-Meier, 95% bands over {interval_units(methods)}; tick: completed episodes, censored"
         figures._headline(axes, _title("Time to failure", methods), sentence)
     return figure
 
@@ -188,7 +188,7 @@ def draw_costs(methods: Sequence[Method], *, theme: Theme = LIGHT) -> Figure:
             share.set(xlim=(0, 1), xlabel=f"{name} kept and completed")
             _percent(share.xaxis)
         _name_rows(panels[0], methods)
-        sentence = f"red: threshold of the cost; black: 95% interval over {resampled_units(methods)}"
+        sentence = f"red: threshold of the cost; black: 95% interval over {interval_units(methods)}"
         figures.headline_of_panels(figure, _title("Costs of an episode", methods), sentence)
     return figure
 
@@ -240,7 +240,7 @@ def _draw_ablation(
         _percent(axes.yaxis)
         axes.grid(axis="y")
         _legend(figure)
-        figures._headline(axes, title, f"bar: 95% interval over {resampled_units([method for _, _, method in points])}")
+        figures._headline(axes, title, f"bar: 95% interval over {interval_units([method for _, _, method in points])}")
     return figure
 
 

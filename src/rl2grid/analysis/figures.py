@@ -39,7 +39,7 @@ from rl2grid.drawing.theme import (
 from rl2grid.records.evaluations import Evaluation
 from rl2grid.records.metrics import SURVIVAL
 from rl2grid.records.recordings import Recording
-from rl2grid.records.statistics import bootstrap_band, episode_mean
+from rl2grid.records.statistics import curve_band, episode_mean
 from rl2grid.records.trainings import Metric, TrainingCurve
 
 STEPS_PER_DAY = 288
@@ -213,7 +213,7 @@ def _draw_runs(axes: Axes, label: str, runs: Sequence[Metric], x: str, colour: s
         return
     position = np.linspace(max(budget[0] for budget in budgets), min(budget[-1] for budget in budgets), CURVE_POINTS)
     lines = [np.interp(position, budget, line) for budget, line in zip(budgets, smoothed, strict=True)]
-    average, low, high = bootstrap_band(lines)
+    average, low, high = curve_band(lines)
     axes.fill_between(position, low, high, color=colour, alpha=0.2, linewidth=0)
     axes.plot(position, average, color=colour, linewidth=2, label=label)
 

@@ -1,21 +1,22 @@
 """Time to failure: how long grids stay alive, after Kaplan and Meier (1958).
 
-A completed month says that the grid lived at least that long: its lifetime is censored. Curves and tests are
-SciPy's; here is what they are asked, and what is made of the points at which their formulas are not defined.
+A completed month says that the grid lived at least that long: its lifetime is censored. Bands are about other runs and
+months, like all intervals: Greenwood's variance of independent lives is multiplied by what the lives of one run, and
+those in one month, have in common (Kish's design effect).
 """
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 
 from rl2grid.arrays import F64
 from rl2grid.records.episodes import Episode
-from rl2grid.records.statistics import LEVEL
+from rl2grid.records.shares import score_interval
+from rl2grid.records.summary import by_scenario
+from rl2grid.records.variance import LEVEL, Spread, crossed_spread
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,9 +24,9 @@ class Lifetimes:
     """How long each episode lived."""
 
     steps: F64
-    """float64 [episode] grid steps survived."""
-    failed: np.ndarray[tuple[int], np.dtype[np.bool_]]
-    """bool [episode] whether it was lost then; else it was completed, and would have lived longer."""
+    """float64 [run, month, seed] grid steps survived."""
+    failed: np.ndarray[tuple[int, int, int], np.dtype[np.bool_]]
+    """bool [run, month, seed] whether it was lost then; else it was completed, and would have lived longer."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,43 +49,37 @@ class SurvivalCurve:
         return float(self.steps[lost[0]]) if lost.size else float("nan")
 
 
-def lifetimes(episodes: Sequence[Episode]) -> Lifetimes:
-    """Lifetimes of episodes that may start anywhere and be of any length."""
-    steps = [round(episode.survival * episode.episode_length) for episode in episodes]
-    return Lifetimes(np.array(steps, np.float64), np.array([not episode.completed for episode in episodes], np.bool_))
+def lifetimes(runs: Sequence[Sequence[Episode]]) -> Lifetimes:
+    """Lifetimes of the episodes of each run, which may start anywhere and be of any length."""
+
+    def stacked(column: str) -> F64:
+        return np.stack([by_scenario(episodes, column) for episodes in runs])
+
+    return Lifetimes(np.round(stacked("survival") * stacked("episode_length")), stacked("completed") == 0)
 
 
 def kaplan_meier(lived: Lifetimes, *, level: float = LEVEL) -> SurvivalCurve:
-    """Share of grids alive over time, with pointwise intervals of Greenwood's variance on the log(-log) scale.
-
-    That scale keeps intervals within 0 and 1. Where it is not defined, all grids being alive or none, the interval
-    is that of the last step at which it was; before the first loss it is [1, 1].
-    """
-    function = stats.ecdf(_censored(lived)).sf
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)
-        interval = function.confidence_interval(level, method="log-log")
-    falls = np.flatnonzero(np.diff(function.probabilities, prepend=1.0) < 0)
-    steps = np.concatenate(([0.0], function.quantiles[falls]))
-    alive, low, high = (
-        _carried(np.concatenate(([1.0], bound.probabilities[falls])))
-        for bound in (function, interval.low, interval.high)
-    )
-    return SurvivalCurve(steps, alive, np.where(alive > 0, low, 0.0), high, lived.steps[~lived.failed])
+    """Share of grids alive over time, with pointwise Wilson intervals, which have a width where all are alive."""
+    falls = np.unique(lived.steps[lived.failed])
+    at_risk = np.array([(lived.steps >= step).sum() for step in falls], np.float64)
+    lost = np.array([(lived.failed & (lived.steps == step)).sum() for step in falls], np.float64)
+    alive = np.concatenate(([1.0], np.cumprod(1 - lost / at_risk)))
+    with np.errstate(divide="ignore"):
+        greenwood = np.concatenate(([0.0], np.cumsum(lost / (at_risk * (at_risk - lost)))))
+    independent = np.where(alive > 0, alive**2 * np.where(alive > 0, greenwood, 0.0), 0.0)
+    steps = np.concatenate(([0.0], falls))
+    effect, freedom = _design_effect(lived, steps)
+    low, high = score_interval(alive, Spread(independent * effect, freedom), lived.steps.shape[1], level=level)
+    return SurvivalCurve(steps, alive, low, high, lived.steps[~lived.failed])
 
 
-def log_rank(x: Lifetimes, y: Lifetimes) -> float:
-    """Two-sided p-value of the log-rank test that both live equally long (Mantel, 1966); 1 where nobody failed."""
-    if not (x.failed.any() or y.failed.any()):
-        return 1.0
-    return float(stats.logrank(_censored(x), _censored(y)).pvalue)
-
-
-def _censored(lived: Lifetimes) -> stats.CensoredData:
-    return stats.CensoredData(uncensored=lived.steps[lived.failed], right=lived.steps[~lived.failed])
-
-
-def _carried(values: F64) -> F64:
-    """Values with the last known one in the place of those that are not defined."""
-    known = np.maximum.accumulate(np.where(np.isnan(values), 0, np.arange(len(values))))
-    return np.asarray(values[known])
+def _design_effect(lived: Lifetimes, steps: F64) -> tuple[F64, F64]:
+    """How many times the variance of independent lives there is after each step, and its degrees of freedom."""
+    lives = ((lived.steps > steps[:, None, None, None]) | ~lived.failed).astype(np.float64)
+    table = lives.mean(axis=-1)
+    by_month = table.mean(axis=-2)
+    share, n = by_month.mean(axis=-1), lived.steps.size
+    spread = crossed_spread(by_month, [table])
+    independent = share * (1 - share) / n
+    is_seen = independent > 0
+    return np.where(is_seen, spread.variance / np.where(is_seen, independent, 1.0), 1.0), spread.freedom

@@ -5,14 +5,22 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
 
-import numpy as np
-
-from rl2grid.analysis.lifetimes import kaplan_meier, lifetimes, log_rank
-from rl2grid.analysis.table import MISSING, Cell, Column, ResultTable, interval_cell, mean_cell, share_cell
+from rl2grid.analysis.comparison_table import comparison_table, pairwise
+from rl2grid.analysis.table import (
+    MISSING,
+    Cell,
+    Column,
+    ResultTable,
+    difference_cell,
+    interval_cell,
+    mean_cell,
+    p_cell,
+    share_cell,
+)
 from rl2grid.envs.tasks import short_id
 from rl2grid.mdp.constraint_table import CONSTRAINTS, THRESHOLDS
 from rl2grid.mdp.termination import GAME_OVER_TEXT, GameOver
-from rl2grid.records.methods import COSTS, Method, resampled_units
+from rl2grid.records.methods import COSTS, Method, interval_words
 from rl2grid.records.statistics import (
     Aggregate,
     estimate,
@@ -20,7 +28,6 @@ from rl2grid.records.statistics import (
     mean_score,
     median_score,
     optimality_gap,
-    probability_of_improvement,
 )
 
 HEURISTIC_LETTERS: dict[str, str] = {"none": "V", "idle": "I", "recovery": "R", "careful": "C"}
@@ -88,15 +95,19 @@ def _ranking_table(
 ) -> ResultTable:
     limit = ranked[0].task.constraint
     limits = (limit,) if limit else tuple(THRESHOLDS)
-    headings = ("Survival", "Completed", *(f"Safe {name}" for name in limits), "Runs", "Scenarios", "Seeds", "Episodes")
+    shares = ("Completed", *(f"Safe {name}" for name in limits))
+    headings = ("Survival", "To the first", "p", *shares, "Runs", "Months", "Seeds", "Episodes")
+    differences = pairwise(ranked)
     survivals = [estimate(method.scores("survival")) for method in ranked]
     best = _printed_best([survival.value for survival in survivals], 3)
     rows = []
-    for name, method, survival in zip(names, ranked, survivals, strict=True):
-        shares = (method.scores("completed"), *(method.safe(name) for name in limits))
+    for place, (name, method, survival) in enumerate(zip(names, ranked, survivals, strict=True)):
+        to_first = differences.get((place, 0))
+        estimates = (method.scores("completed"), *(method.safe(name) for name in limits))
         cells = (
             interval_cell(survival, best=round(survival.value, 3) == best),
-            *(share_cell(estimate(scores)) for scores in shares),
+            *((difference_cell(to_first), p_cell(to_first)) if to_first else (MISSING, MISSING)),
+            *(share_cell(estimate(scores)) for scores in estimates),
         )
         counts = [str(number) for number in (*method.scores("survival").values.shape, len(method.episodes))]
         if not method.is_trained:
@@ -105,8 +116,9 @@ def _ranking_table(
     kept = " or ".join(f"{name} at most {THRESHOLDS[name]:g}" for name in limits)
     order = "share of safe episodes, then survival" if limit else "survival"
     caption = (
-        f"By {order}. Survival: mean share of the episode; others: shares of episodes. Intervals: 95%, bootstrap over "
-        f"{resampled_units(ranked)}. Safe: completed, and cost {kept}. Runs: trainings of the method."
+        f"By {order}. Survival: mean share of the episode. To the first: difference in survival to the first row "
+        "on the same months; p: that there is none, Holm's correction over all pairs of methods. Others: shares of "
+        f"episodes. Safe: completed, and cost {kept}. Runs: trainings of the method. {interval_words(ranked)}."
     )
     columns = (*name_columns, *(Column(heading) for heading in headings))
     return ResultTable(f"ranking-{_task_name(ranked[0])}", caption, columns, tuple(rows))
@@ -140,7 +152,7 @@ def survival_table(methods: Methods, kind: str) -> ResultTable:
     actions = "topology" if kind == "T" else "redispatch"
     caption = (
         f"Mean survival on tasks with {actions} actions (higher is better; best of a task in bold), plus or minus half "
-        f"of its 95% bootstrap interval over {_units(methods, tasks)}. "
+        f"of its interval. {_intervals(methods, tasks)}. "
         "V: vanilla, I: idle, R: recovery and C: careful heuristic."
     )
     return ResultTable(f"survival-{actions}", caption, columns, tuple(rows))
@@ -165,8 +177,8 @@ def aggregate_table(methods: Methods) -> ResultTable:
             ]
             rows.append((*_names(method), *cells))
     caption = (
-        f"Survival, with 95% bootstrap intervals over {_units(methods, methods)}. Median: over months, of a month's "
-        "mean; IQM: mean of the middle half of all episodes; optimality gap: what is missing to full survival."
+        "Survival. Median: over months, of a month's mean; IQM: mean of the middle half of all episodes; optimality "
+        f"gap: what is missing to full survival. {_intervals(methods, methods)}."
     )
     return ResultTable("aggregates", caption, columns, tuple(rows))
 
@@ -193,8 +205,8 @@ def constraint_table(methods: Methods) -> ResultTable:
     meanings = "; ".join(f"{name}: {constraint.text}" for name, constraint in CONSTRAINTS.items())
     caption = (
         "Costs of an episode and the share of episodes that keep the threshold, alone and together with being "
-        f"completed: a grid that is lost early costs little, too. {meanings}. Plus or minus half of the 95% bootstrap "
-        f"interval over {_units(methods, methods)}."
+        f"completed: a grid that is lost early costs little, too. {meanings}. Plus or minus half of the interval. "
+        f"{_intervals(methods, methods)}."
     )
     return ResultTable("constraints", caption, columns, tuple(rows))
 
@@ -210,7 +222,7 @@ def score_table(methods: Methods) -> ResultTable:
     caption = (
         "Operational scores, means per grid step. Margin: free capacity, summed over lines, -1 for one that is out; "
         "overload: 0 without overloads and disconnections, down to -1; topology: minus the elements that are not on "
-        f"busbar 1. Plus or minus half of the 95% bootstrap interval over {_units(methods, methods)}."
+        f"busbar 1. Plus or minus half of the interval. {_intervals(methods, methods)}."
     )
     return ResultTable("scores", caption, columns, tuple(rows))
 
@@ -227,34 +239,6 @@ def ending_table(methods: Methods) -> ResultTable:
         rows.append((*_names(method), Cell(str(len(endings))), *(Cell(str(count)) for count in counts)))
     caption = "How episodes ended. " + " ".join(f"{_short(r).capitalize()}: {GAME_OVER_TEXT[r]}." for r in reasons)
     return ResultTable("endings", caption.strip(), columns, tuple(rows))
-
-
-def comparison_table(methods: Methods) -> ResultTable:
-    """Every pair of methods of a task: who improves on whom, and whether they live equally long."""
-    columns = (
-        Column("Task", words=True),
-        Column("X", words=True),
-        Column("Y", words=True),
-        Column("P(X > Y)"),
-        Column("median life of X, steps"),
-        Column("median life of Y, steps"),
-        Column("log-rank p"),
-    )
-    rows = []
-    for group in methods.values():
-        for x, y in itertools.combinations(group, 2):
-            improvement = probability_of_improvement(x.scores("survival"), y.scores("survival"))
-            lived = lifetimes(x.episodes), lifetimes(y.episodes)
-            medians = [Cell(_steps(kaplan_meier(one).median)) for one in lived]
-            p = log_rank(*lived)
-            names = (Cell(_task_name(x)), Cell(x.label), Cell(y.label))
-            rows.append((*names, interval_cell(improvement), *medians, Cell("< 0.0001" if p < 1e-4 else f"{p:.4f}")))
-    caption = (
-        "P(X > Y): how probably X survives longer than Y in the same month, ties counted half, with its 95% bootstrap "
-        "interval. Median life: grid steps after which half of the episodes are lost (Kaplan-Meier; a dash where more "
-        "than half are completed). Log-rank: p-value that both live equally long, not corrected for many pairs."
-    )
-    return ResultTable("comparisons", caption, columns, tuple(rows))
 
 
 def _printed_best(values: Sequence[float], digits: int) -> float | None:
@@ -297,13 +281,9 @@ def _task_name(method: Method) -> str:
     return short_id(method.task.id)
 
 
-def _units(methods: Methods, tasks: Iterable[str]) -> str:
-    return resampled_units(method for task in tasks for method in methods[task])
+def _intervals(methods: Methods, tasks: Iterable[str]) -> str:
+    return interval_words(method for task in tasks for method in methods[task])
 
 
 def _short(reason: GameOver) -> str:
     return reason.name.replace("_", " ").lower()
-
-
-def _steps(value: float) -> str:
-    return MISSING.text if np.isnan(value) else f"{value:,.0f}"

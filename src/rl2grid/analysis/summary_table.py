@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import rich.box
 from rich.table import Table
 
-from rl2grid.analysis.table import markdown_row, with_interval
+from rl2grid.analysis.table import markdown_row, share_text, with_interval
 from rl2grid.records.statistics import Estimate
 from rl2grid.records.summary import Summary
 
@@ -31,8 +31,8 @@ N_LABELS = 2
 """Leading columns that hold words."""
 
 LEGEND = (
-    "Means per episode with 95% bootstrap intervals: over seeds within scenarios, or over scenarios where each was "
-    "played with one seed. Survival: share of the episode survived; "
+    "Means per episode with 95% intervals over months alone: one policy says nothing of other trainings. Survival: "
+    "share of the episode survived; "
     "IQM: interquartile mean. Safe: cost within the threshold and episode completed. "
     "Margin, overload, topology: the operational scores, means per step."
 )
@@ -46,12 +46,12 @@ def table_cells(summary: Summary) -> list[str]:
         str(summary.episodes),
         with_interval(summary.survival, 3),
         with_interval(summary.survival_iqm, 3),
-        _percent(summary.completed),
+        share_text(summary.completed),
         _number(summary.episode_return),
         _number(summary.cost_lsi),
-        _percent(summary.safe_lsi),
+        share_text(summary.safe_lsi),
         _number(summary.cost_tlo),
-        _percent(summary.safe_tlo),
+        share_text(summary.safe_tlo),
         _number(summary.score_margin),
         _number(summary.score_overload),
         _number(summary.score_topology),
@@ -59,7 +59,7 @@ def table_cells(summary: Summary) -> list[str]:
 
 
 def rich_table(summaries: Sequence[Summary], title: str | None = None) -> Table:
-    """A table for the terminal, 80 characters wide: long names are folded; the best survival is bold.
+    """A table for the terminal, 80 characters wide: intervals stand below; the best survival is bold.
 
     "Done" is the share of episodes completed.
     """
@@ -77,9 +77,9 @@ def rich_table(summaries: Sequence[Summary], title: str | None = None) -> Table:
     for summary in summaries:
         cells = dict(zip(HEADINGS, table_cells(summary), strict=True))
         table.add_row(
-            summary.agent if summary.heuristic == "none" else f"{summary.agent} + {summary.heuristic}",
+            summary.agent if summary.heuristic == "none" else f"{summary.agent}\n+ {summary.heuristic}",
             *(
-                cells[name]
+                cells[name].replace(" [", "\n[")
                 for name in ("survival", "completed", "return", "LSI cost", "safe LSI", "TLO cost", "safe TLO")
             ),
             style="bold" if is_best(summary, summaries) else None,
@@ -102,10 +102,6 @@ def markdown_table(summaries: Sequence[Summary]) -> str:
 def is_best(summary: Summary, summaries: Sequence[Summary]) -> bool:
     """Whether no other agent survives longer on average; of one agent alone, nobody is best."""
     return len(summaries) > 1 and summary.survival.value == max(other.survival.value for other in summaries)
-
-
-def _percent(estimate: Estimate) -> str:
-    return f"{100 * estimate.value:.0f}%"
 
 
 def _number(estimate: Estimate) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -12,6 +13,7 @@ import rich.box
 from rich.table import Table
 from rich.text import Text
 
+from rl2grid.records.comparisons import Difference
 from rl2grid.records.statistics import Estimate
 
 
@@ -58,8 +60,10 @@ MISSING = Cell("-")
 
 
 def mean_cell(estimate: Estimate, *, digits: int = 2, best: bool = False) -> Cell:
-    """A value and half the width of its interval, as "0.97 ± 0.02"."""
+    """A value and half the width of its interval, as "0.97 ± 0.02"; the value alone where there is none."""
     half = (estimate.high - estimate.low) / 2
+    if math.isnan(half):
+        return Cell(f"{estimate.value:,.{digits}f}", estimate, best)
     return Cell(f"{estimate.value:,.{digits}f} ± {half:,.{digits}f}", estimate, best)
 
 
@@ -70,8 +74,26 @@ def interval_cell(estimate: Estimate, *, digits: int = 3, best: bool = False) ->
 
 def share_cell(estimate: Estimate) -> Cell:
     """A share and both ends of its interval, as "97% [95, 99]"."""
-    text = f"{100 * estimate.value:.0f}% [{100 * estimate.low:.0f}, {100 * estimate.high:.0f}]"
-    return Cell(text, estimate)
+    return Cell(share_text(estimate), estimate)
+
+
+def share_text(estimate: Estimate) -> str:
+    """A share and both ends of its interval, as "97% [95, 99]"."""
+    return f"{100 * estimate.value:.0f}% [{100 * estimate.low:.0f}, {100 * estimate.high:.0f}]"
+
+
+def difference_cell(difference: Difference, *, digits: int = 3) -> Cell:
+    """A difference and both ends of its interval, as "+0.120 [-0.010, +0.250]"."""
+    one = difference.estimate
+    ends = "" if math.isnan(one.low) else f" [{one.low:+.{digits}f}, {one.high:+.{digits}f}]"
+    return Cell(f"{one.value:+.{digits}f}{ends}", one)
+
+
+def p_cell(difference: Difference) -> Cell:
+    """The corrected p-value of a difference, as "0.012" or "< 0.001"."""
+    if math.isnan(difference.holm):
+        return MISSING
+    return Cell("< 0.001" if difference.holm < 0.001 else f"{difference.holm:.3f}")
 
 
 def result_table_rich(table: ResultTable, title: str | None = None) -> Table:
@@ -142,7 +164,9 @@ WRITERS: dict[str, Callable[[ResultTable], str]] = {"md": table_markdown, "tex":
 
 
 def with_interval(estimate: Estimate, digits: int) -> str:
-    """A value and both ends of its interval, as "0.970 [0.950, 0.990]"."""
+    """A value and both ends of its interval, as "0.970 [0.950, 0.990]"; the value alone where there is none."""
+    if math.isnan(estimate.low):
+        return f"{estimate.value:.{digits}f}"
     return f"{estimate.value:.{digits}f} [{estimate.low:.{digits}f}, {estimate.high:.{digits}f}]"
 
 

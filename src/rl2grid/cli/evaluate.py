@@ -1,19 +1,25 @@
-"""``rl2grid evaluate``: play an agent on enumerated scenarios, print the aggregates, keep every episode."""
+"""``rl2grid evaluate``: play agents on enumerated scenarios, print the aggregates, keep every episode, compare."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
+from rl2grid.analysis.comparison_table import reference_table
 from rl2grid.analysis.summary_table import rich_table
+from rl2grid.analysis.table import result_table_rich
 from rl2grid.cli import keywords
-from rl2grid.envs.tasks import find_task
+from rl2grid.envs.tasks import Task, find_task
+from rl2grid.errors import UsageError
+from rl2grid.evaluation.agents import make_agent
 from rl2grid.evaluation.flags import environment_flags, evaluate_command
 from rl2grid.evaluation.protocol import evaluate, first_months
+from rl2grid.records.evaluations import Evaluation
+from rl2grid.records.methods import group_methods
 
 
 def run(options: argparse.Namespace) -> int:
@@ -23,28 +29,60 @@ def run(options: argparse.Namespace) -> int:
         UsageError: the request cannot be met; nothing was written.
     """
     task = find_task(options.task)
+    agents: Sequence[str] = options.agents
+    if len(set(agents)) < len(agents):
+        raise UsageError("An agent was named twice: name each once.")
+    if options.output is not None and len(agents) > 1:
+        raise UsageError("--output is the folder of one agent: leave it out, and each gets a folder of its own.")
+    for agent in agents:  # before anything is played: one that does not exist would be found after an hour of others
+        make_agent(agent, task)
+    results = [_evaluated(agent, task, options) for agent in agents]
+    console = Console()
+    summaries = [result.summary for result in results]
+    console.print(rich_table(summaries, title=f"{task.id}, {options.split} scenarios"))
+    for result in results:
+        if result.foresight:
+            print(
+                f"{result.summary.agent} stepped saved true worlds: with this foresight it is not ranked with others."
+            )
+    if len(results) > 1:
+        _compare(results, console)
+    for result in results:
+        assert result.folder is not None
+        print(f"{len(result.episodes)} episodes in {result.folder / 'episodes.csv'}.")
+    return 0
+
+
+def _evaluated(agent: str, task: Task, options: argparse.Namespace) -> Evaluation:
     chosen = keywords.given(options)
-    output: Path = options.output or _default_output(options, task.id.removeprefix("rl2grid/"), chosen)
-    result = evaluate(
-        options.agent,
+    return evaluate(
+        agent,
         task,
         split=options.split,
         scenarios=None if options.months is None else first_months(task, options.split, options.months),
         seeds=range(options.seeds),
         workers=options.workers,
-        output=output,
+        output=options.output or _default_output(agent, options, task.id.removeprefix("rl2grid/"), chosen),
         progress=True,
-        command=evaluate_command(options.agent, task, options.split, options.seeds, options.months, chosen),
+        command=evaluate_command(agent, task, options.split, options.seeds, options.months, chosen),
         **chosen,
     )
-    Console().print(rich_table([result.summary], title=f"{task.id}, {options.split} scenarios"))
-    if result.foresight:
-        print("The agent stepped saved true worlds: with this foresight it is not ranked with others.")
-    print(f"{len(result.episodes)} episodes in {output / 'episodes.csv'}.")
-    return 0
 
 
-def _default_output(options: argparse.Namespace, task: str, chosen: Mapping[str, Any]) -> Path:
+def _compare(results: Sequence[Evaluation], console: Console) -> None:
+    try:
+        (methods,) = group_methods(results).values()
+    except UsageError as error:
+        print(f"Not compared: {error}")
+        return
+    if len(methods) < 2:
+        return
+    # A table cut to the width of a pipe would lose columns.
+    wide = console if console.is_terminal else Console(width=120)
+    wide.print(result_table_rich(reference_table(methods), title="Paired differences"))
+
+
+def _default_output(agent: str, options: argparse.Namespace, task: str, chosen: Mapping[str, Any]) -> Path:
     """Inside the run for one of its policies; else by task and agent."""
     parts = [options.split]
     if "heuristic" in chosen:
@@ -53,9 +91,9 @@ def _default_output(options: argparse.Namespace, task: str, chosen: Mapping[str,
         parts.append(f"{options.months}-months")
     parts += [flag.removeprefix("--") for flag in environment_flags({**chosen, "heuristic": None})]
     name = "-".join(parts)
-    path = Path(options.agent)
+    path = Path(agent)
     if path.is_dir():
         return path / "evaluation" / name
     if path.is_file():
         return path.parent / "evaluation" / f"{path.stem}-{name}"
-    return Path("runs") / f"{task}-{options.agent}" / "evaluation" / name
+    return Path("runs") / f"{task}-{agent}" / "evaluation" / name

@@ -107,7 +107,11 @@ def _tasks(options: argparse.Namespace) -> int:
 def _add_evaluate(commands: argparse._SubParsersAction[_Parser]) -> None:
     parser = commands.add_parser("evaluate", help="play agents on enumerated scenarios, one row per episode")
     parser.add_argument(
-        "agent", help="do-nothing, random, recovery, greedy, greedy-n1, milp, dc-opf, or a run folder or checkpoint"
+        "agents",
+        nargs="+",
+        metavar="agent",
+        help="do-nothing, random, recovery, greedy, greedy-n1, milp, dc-opf, or a run folder or checkpoint; several "
+        "are compared with the first on the same months",
     )
     parser.add_argument("task", help="for example bus14-T0")
     parser.add_argument("--split", default="validation", choices=SPLITS, help="validation picks models; test is last")
@@ -119,7 +123,7 @@ def _add_evaluate(commands: argparse._SubParsersAction[_Parser]) -> None:
     parser.add_argument(
         "--workers", type=int, default=None, help="processes; by default this one (native) or one per core (reference)"
     )
-    parser.add_argument("--output", type=Path, default=None, help="folder of the results")
+    parser.add_argument("--output", type=Path, default=None, help="folder of the results of one agent")
     parser.set_defaults(run=_evaluate)
 
 

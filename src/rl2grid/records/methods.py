@@ -12,8 +12,8 @@ from rl2grid.errors import UsageError
 from rl2grid.mdp.constraint_table import CONSTRAINTS, THRESHOLDS
 from rl2grid.records.episodes import Episode
 from rl2grid.records.evaluations import Evaluation, check_comparable
-from rl2grid.records.statistics import Scores, Unit
-from rl2grid.records.summary import by_scenario, safe_episodes
+from rl2grid.records.statistics import UNIT, Scores
+from rl2grid.records.summary import column_scores, safe_scores
 
 COSTS: dict[str, str] = {name: constraint.column for name, constraint in CONSTRAINTS.items()}
 """Column of each cost in the rows of episodes."""
@@ -67,16 +67,15 @@ class Method:
 
     def scores(self, column: str) -> Scores:
         """A column of :class:`~rl2grid.records.episodes.Episode`."""
-        return Scores(np.stack([by_scenario(result.episodes, column) for result in self.evaluations]))
+        return column_scores([result.episodes for result in self.evaluations], column)
 
     def within(self, constraint: str) -> Scores:
         """1 for episodes whose cost reached its threshold at most, else 0."""
-        return Scores((self.scores(COSTS[constraint]).values <= THRESHOLDS[constraint]).astype(np.float64))
+        return Scores((self.scores(COSTS[constraint]).values <= THRESHOLDS[constraint]).astype(np.float64), UNIT)
 
     def safe(self, constraint: str) -> Scores:
         """1 for episodes that were completed as well: dying early is not safety."""
-        limits = {constraint: THRESHOLDS[constraint]}
-        return Scores(np.stack([safe_episodes(result.episodes, limits) for result in self.evaluations]))
+        return safe_scores([result.episodes for result in self.evaluations], constraint)
 
 
 def method_label(episode: Episode) -> str:
@@ -101,10 +100,27 @@ def group_methods(results: Sequence[Evaluation]) -> dict[str, tuple[Method, ...]
     return {task: _methods(group) for task, group in by_task.items()}
 
 
-def resampled_units(methods: Iterable[Method]) -> str:
-    """What intervals of these methods are about, in words: the coarsest of what was repeated."""
-    units = {method.scores("survival").unit for method in methods}
-    return ", else ".join(unit.value for unit in Unit if unit in units)
+def interval_units(methods: Iterable[Method]) -> str:
+    """What intervals of these methods are over, in few words."""
+    repeated = {len(method.evaluations) > 1 for method in methods}
+    if repeated == {True}:
+        return "training runs and months"
+    return "training runs and months, of one run over months alone" if True in repeated else "months alone"
+
+
+def interval_words(methods: Iterable[Method]) -> str:
+    """What 95% intervals of these methods are about, as a sentence without its end."""
+    known = list({(method.label, method.is_trained, len(method.evaluations)): None for method in methods})
+    crossed = [label for label, _, runs in known if runs > 1]
+    alone = [label for label, is_trained, runs in known if is_trained and runs == 1]
+    untrained = [label for label, is_trained, runs in known if not is_trained and runs == 1]
+    parts = ["training runs and months, crossed"] if crossed else []
+    if untrained:
+        parts.append("months alone where nothing was trained" if crossed or alone else "months, as nothing was trained")
+    if alone:
+        names = ", ".join(dict.fromkeys(alone))
+        parts.append(f"months alone for the one training run of {names}, which says nothing of other trainings")
+    return f"95% intervals over {'; over '.join(parts)}"
 
 
 def _methods(results: Sequence[Evaluation]) -> tuple[Method, ...]:

@@ -1,30 +1,35 @@
-"""Point estimates and intervals of few, skewed results, after Agarwal et al. (2021).
+"""Point estimates of a method's results and their intervals: runs and months crossed.
 
-"Deep Reinforcement Learning at the Edge of the Statistical Precipice" recommends the interquartile
-mean and percentile intervals of a bootstrap stratified by task, performance profiles, and the
-probability of improvement. What are tasks there are scenarios here: months of one grid. The random
-numbers of the bootstrap come from a counter-based generator, so that an interval is a function of the
-results alone.
+Aggregates are those of Agarwal et al. (2021), "Deep Reinforcement Learning at the Edge of the Statistical Precipice",
+with months of one grid in the place of tasks. Their intervals are about other runs *and* other months: the bootstrap
+draws both anew, each on its own (Owen, 2007: the pigeonhole bootstrap), so that a run plays all months that are drawn.
+Where there is one run, months alone are drawn: the same interval, which then says nothing of other runs.
+
+Percentiles of such resamples are too narrow with few runs, and too wide for what runs and months do together. They are
+corrected by what the bootstrap gets wrong of the mean, whose variance :mod:`rl2grid.records.variance` knows: the
+distance of both ends from the estimate is multiplied so that the interval of a mean is as wide as Student's t. Figures
+between 0 and 1 have Wilson's interval with the same corrected variance, :mod:`rl2grid.records.shares`: percentiles
+know nothing of the bounds, and have no width where all months end alike.
 """
 
 from __future__ import annotations
 
-import enum
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
+from statistics import NormalDist
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from rl2grid.arrays import F64
+from rl2grid.records.resampling import MONTHS, RESAMPLES, drawn
+from rl2grid.records.shares import score_interval, share_intervals
+from rl2grid.records.variance import LEVEL, Spread, crossed_spread, t_quantile
 
-Statistic = Callable[[F64], F64]
-"""Maps float64 [..., result] to float64 [...]."""
-
-RESAMPLES = 2000
-"""Bootstrap samples of an interval."""
-LEVEL = 0.95
-"""Coverage that intervals aim at."""
+UNIT = (0.0, 1.0)
+"""Bounds of shares, of survival, and of probabilities."""
+_CELLS_AT_ONCE = 250_000
+"""Of resampled tables: what is in memory at a time."""
 
 
 @dataclass(frozen=True)
@@ -33,20 +38,11 @@ class Estimate:
 
     value: float
     low: float
+    """NaN, like :attr:`high`, where results of one month alone tell nothing of others."""
     high: float
 
     def __str__(self) -> str:
         return f"{self.value:.3f} [{self.low:.3f}, {self.high:.3f}]"
-
-
-class Unit(enum.Enum):
-    """What a bootstrap draws anew, and hence what an interval is about."""
-
-    RUN = "training runs"
-    """Whole runs: all scenarios of a run stay together, because one policy played them."""
-    SEED = "seeds within scenarios"
-    """Episodes within every scenario, as rliable draws runs within every task."""
-    SCENARIO = "scenarios"
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,204 +50,170 @@ class Scores:
     """A figure of every episode of one method, such as its survival."""
 
     values: F64
-    """float64 [run, scenario, seed]; one run where nothing was trained."""
+    """float64 [run, month, seed]; one run where nothing was trained."""
+    bounds: tuple[float, float] = (-np.inf, np.inf)
+    """What the figure cannot leave, and no interval either."""
 
     def __post_init__(self) -> None:
         if self.values.ndim != 3 or self.values.size == 0:
-            raise ValueError(f"Scores must be a non-empty array [run, scenario, seed], got {self.values.shape}.")
+            raise ValueError(f"Scores must be a non-empty array [run, month, seed], got {self.values.shape}.")
         if not np.isfinite(self.values).all():
             raise ValueError("Scores must be finite numbers.")
 
     @property
-    def unit(self) -> Unit:
-        """The coarsest repetition there is; scenarios where nothing was repeated."""
-        runs, _, seeds = self.values.shape
-        return Unit.RUN if runs > 1 else Unit.SEED if seeds > 1 else Unit.SCENARIO
+    def runs(self) -> int:
+        """How many trainings; 1 where nothing was trained."""
+        return len(self.values)
 
     @property
-    def by_scenario(self) -> F64:
-        """float64 [scenario, repetition], run by run."""
-        return np.asarray(np.moveaxis(self.values, 0, 1).reshape(self.values.shape[1], -1))
+    def months(self) -> int:
+        return int(self.values.shape[1])
 
-    def resampled(self, unit: Unit, resamples: int = RESAMPLES, seed: int = 0) -> F64:
-        """float64 [resample, scenario, repetition], ``unit`` drawn with replacement."""
-        runs, scenarios, seeds = self.values.shape
-        if unit is Unit.RUN:
-            drawn = self.values[_draw([np.arange(runs)], resamples, seed)]
-            return np.asarray(np.moveaxis(drawn, 1, 2).reshape(resamples, scenarios, runs * seeds))
-        if unit is Unit.SCENARIO:
-            return np.asarray(self.by_scenario[_draw([np.arange(scenarios)], resamples, seed)])
-        flat = self.by_scenario.reshape(-1)
-        members = list(np.arange(flat.size).reshape(scenarios, -1))
-        return np.asarray(flat[_draw(members, resamples, seed)].reshape(resamples, scenarios, -1))
+    @property
+    def table(self) -> F64:
+        """Means over seeds, float64 [run, month]."""
+        return np.asarray(self.values.mean(axis=-1))
 
+    @property
+    def by_month(self) -> F64:
+        """Means over runs and seeds, float64 [month]."""
+        return np.asarray(self.values.mean(axis=(0, 2)))
 
-Aggregate = Callable[[F64], F64]
-"""Maps float64 [..., scenario, repetition] to float64 [...], or [..., threshold]."""
+    @property
+    def spread(self) -> Spread:
+        """Of the mean."""
+        return crossed_spread(self.by_month, [self.table])
 
 
-def mean_score(scores: F64) -> F64:
-    """Mean over scenarios and repetitions."""
-    return np.asarray(scores.mean(axis=(-2, -1)))
+Aggregate = Callable[[F64, F64, F64], F64]
+"""Maps values [run, month, seed] and how often runs [resample, run] and months [resample, month] were drawn to a figure
+of each resample, float64 [resample]."""
 
 
-def iqm_score(scores: F64) -> F64:
-    """Interquartile mean over scenarios and repetitions together."""
-    return interquartile_mean(scores.reshape(*scores.shape[:-2], -1))
+def mean_score(values: F64, runs: F64, months: F64) -> F64:
+    """Mean over runs, months and seeds."""
+    table = values.mean(axis=-1)
+    return np.asarray((runs @ table * months).sum(axis=-1) / table.size)
 
 
-def median_score(scores: F64) -> F64:
-    """Median over scenarios of the mean over repetitions."""
-    return np.asarray(np.median(scores.mean(axis=-1), axis=-1))
+def iqm_score(values: F64, runs: F64, months: F64) -> F64:
+    """Interquartile mean over all episodes: without the lowest and the highest quarter (rounded down)."""
+    order = np.argsort(values, axis=None)
+    run, month, _ = np.unravel_index(order, values.shape)
+    cut = values.size // 4
+    counted = np.cumsum(runs[:, run] * months[:, month], axis=-1)
+    kept = np.diff(np.clip(counted, cut, values.size - cut), axis=-1, prepend=cut)
+    return np.asarray(kept @ values.reshape(-1)[order] / (values.size - 2 * cut))
 
 
-def optimality_gap(scores: F64, target: float = 1.0) -> F64:
+def median_score(values: F64, runs: F64, months: F64) -> F64:
+    """Median over months of the mean over runs and seeds."""
+    means = runs @ values.mean(axis=-1) / values.shape[0]
+    order = np.argsort(means, axis=-1)
+    ranked, counted = np.take_along_axis(means, order, -1), np.cumsum(np.take_along_axis(months, order, -1), axis=-1)
+    n = values.shape[1]
+    middle = [np.argmax(counted >= rank, axis=-1)[:, None] for rank in ((n + 1) // 2, n // 2 + 1)]
+    return np.asarray(sum(np.take_along_axis(ranked, place, -1)[:, 0] for place in middle) / 2)
+
+
+def optimality_gap(values: F64, runs: F64, months: F64, target: float = 1.0) -> F64:
     """What is missing to ``target`` on average; what exceeds it does not make up for what is missing elsewhere."""
-    return np.asarray(target - np.minimum(scores, target).mean(axis=(-2, -1)))
+    return target - mean_score(np.minimum(values, target), runs, months)
 
 
-def share_above(thresholds: ArrayLike) -> Aggregate:
-    """The performance profile: share of all scores above each of the thresholds [threshold]."""
-    levels = np.asarray(thresholds, np.float64)
-
-    def share(scores: F64) -> F64:
-        flat = np.sort(scores.reshape(*scores.shape[:-2], -1), axis=-1)
-        rows = flat.reshape(-1, flat.shape[-1])
-        above = np.stack([row.size - np.searchsorted(row, levels, side="right") for row in rows])
-        return np.asarray(above.reshape(*flat.shape[:-1], len(levels)) / flat.shape[-1])
-
-    return share
+def aggregated(scores: Scores, aggregate: Aggregate = mean_score) -> float:
+    """An aggregate of the scores as they are."""
+    return float(aggregate(scores.values, np.ones((1, scores.runs)), np.ones((1, scores.months)))[0])
 
 
 def estimate(
-    scores: Scores,
-    aggregate: Aggregate = mean_score,
-    *,
-    resamples: int = RESAMPLES,
-    level: float = LEVEL,
-    seed: int = 0,
+    scores: Scores, aggregate: Aggregate = mean_score, *, resamples: int = RESAMPLES, level: float = LEVEL
 ) -> Estimate:
-    """An aggregate of scores, with the percentile interval of a bootstrap over :attr:`Scores.unit`."""
-    value, low, high = score_band(scores, aggregate, resamples=resamples, level=level, seed=seed)
-    return Estimate(float(value), float(low), float(high))
+    """An aggregate of scores with its interval over runs and months."""
+    value, spread = aggregated(scores, aggregate), scores.spread
+    is_mean = aggregate is mean_score
+    if is_mean and scores.bounds == UNIT:
+        return bounded(value, spread, scores.months, level)
+    means = resampled(scores, mean_score, resamples)
+    samples = means if is_mean else resampled(scores, aggregate, resamples)
+    if scores.bounds == UNIT:
+        share = samples.var() / means.var() if means.var() > 0 else 1.0
+        return bounded(value, Spread(spread.variance * share, spread.freedom), scores.months, level)
+    return stretched(value, samples, means, spread, scores.bounds, level)
 
 
-def score_band(
-    scores: Scores, aggregate: Aggregate, *, resamples: int = RESAMPLES, level: float = LEVEL, seed: int = 0
-) -> tuple[F64, F64, F64]:
-    """:func:`estimate` of an aggregate with several values, such as :func:`share_above`: value, low and high."""
-    samples = aggregate(scores.resampled(scores.unit, resamples, seed))
-    low, high = np.quantile(samples, [(1 - level) / 2, (1 + level) / 2], axis=0)
-    return aggregate(scores.by_scenario), low, high
+def bounded(value: float, spread: Spread, months: int, level: float = LEVEL) -> Estimate:
+    """A figure between 0 and 1 with Wilson's interval."""
+    low, high = score_interval(value, spread, months, level=level)
+    return Estimate(value, float(low), float(high))
 
 
-def probability_of_improvement(
-    x: Scores, y: Scores, *, resamples: int = RESAMPLES, level: float = LEVEL, seed: int = 0
-) -> Estimate:
-    """P(X > Y): how probably an episode of X scores more than one of Y in the same scenario, ties counted half.
-
-    It is the mean over scenarios of the Mann-Whitney statistic, divided by the number of pairs. The
-    interval resamples both methods on their own; where neither has repetitions, it resamples scenarios.
-
-    Raises:
-        ValueError: the methods were not scored on equally many scenarios.
-    """
-    a, b = x.by_scenario, y.by_scenario
-    if len(a) != len(b):
-        raise ValueError(f"Methods must be scored on the same scenarios, got {len(a)} and {len(b)} of them.")
-    wins = (a[:, :, None] > b[:, None, :]) + 0.5 * (a[:, :, None] == b[:, None, :])
-    if x.unit is y.unit is Unit.SCENARIO:
-        samples = wins.mean(axis=(1, 2))[_draw([np.arange(len(a))], resamples, seed)].mean(axis=1)
-    else:
-        # How often each repetition is drawn decides everything: no need to compare again in each resample.
-        left, right = _weights(x, resamples, 2 * seed), _weights(y, resamples, 2 * seed + 1)
-        samples = np.einsum("bsj,bsj->b", np.einsum("bsi,sij->bsj", left, wins, optimize=True), right) / len(a)
-    low, high = np.quantile(samples, [(1 - level) / 2, (1 + level) / 2])
-    return Estimate(float(wins.mean()), float(low), float(high))
-
-
-def _weights(scores: Scores, resamples: int, seed: int) -> F64:
-    """Share of each repetition in each resample, float64 [resample, scenario, repetition]; equal if there is one."""
-    runs, scenarios, seeds = scores.values.shape
-    repetitions = runs * seeds
-    if scores.unit is Unit.SCENARIO:
-        return np.ones((resamples, scenarios, 1))
-    number = np.arange(repetitions, dtype=np.float64)
-    labels = Scores(np.broadcast_to(number.reshape(runs, 1, seeds), scores.values.shape).copy())
-    drawn = labels.resampled(scores.unit, resamples, seed)
-    return np.stack([(drawn == k).mean(axis=-1) for k in range(repetitions)], axis=-1)
-
-
-def mean(values: F64) -> F64:
-    """Mean over the last axis."""
-    return np.asarray(values.mean(axis=-1))
-
-
-def interquartile_mean(values: F64) -> F64:
-    """Mean over the last axis of what is left without the lowest and the highest quarter (rounded down)."""
-    n = values.shape[-1]
-    cut = n // 4
-    return np.asarray(np.sort(values, axis=-1)[..., cut : n - cut].mean(axis=-1))
-
-
-def stratified_bootstrap(
-    values: ArrayLike,
-    statistic: Statistic = mean,
-    *,
-    strata: Sequence[object] | None = None,
-    resamples: int = RESAMPLES,
-    level: float = LEVEL,
-    seed: int = 0,
-) -> Estimate:
-    """A statistic of all results, with the percentile interval of a stratified bootstrap.
-
-    Each resample draws, with replacement and within every stratum, as many results as the stratum has,
-    and computes the statistic over all of them. The strata decide what the interval is about: with one
-    per scenario it tells how the figure would vary with other seeds on the same scenarios; with results
-    of different scenarios in one stratum, how it would vary with other scenarios.
+def resampled(scores: Scores, aggregate: Aggregate, resamples: int = RESAMPLES, stream: int = MONTHS + 1) -> F64:
+    """An aggregate in each resample, float64 [resample].
 
     Args:
-        values: [result].
-        statistic: :func:`mean`, :func:`interquartile_mean` or alike.
-        strata: [result] the stratum of each result; None: all are in one.
+        scores: of one method.
+        aggregate: of them.
         resamples: number of bootstrap samples.
-        level: coverage of the interval.
-        seed: of the bootstrap's random numbers.
-
-    Raises:
-        ValueError: no values, values that are not finite, or ``strata`` of another length.
+        stream: of the draws of runs; those of months are the same for all methods.
     """
-    results = np.asarray(values, dtype=np.float64)
-    if results.ndim != 1 or results.size == 0:
-        raise ValueError(f"Results must be a non-empty array [result], got shape {results.shape}.")
-    if not np.isfinite(results).all():
-        raise ValueError("Results must be finite numbers.")
-    samples = statistic(results[_draw(_members(strata, len(results)), resamples, seed)])
-    low, high = np.quantile(samples, [(1 - level) / 2, (1 + level) / 2])
-    return Estimate(float(statistic(results)), float(low), float(high))
+    runs, months = drawn(scores.runs, resamples, stream), drawn(scores.months, resamples, MONTHS)
+    block = max(1, _CELLS_AT_ONCE // scores.values.size)
+    parts = [
+        aggregate(scores.values, runs[first : first + block], months[first : first + block])
+        for first in range(0, resamples, block)
+    ]
+    return np.concatenate(parts)
 
 
-def bootstrap_band(
-    curves: ArrayLike, *, resamples: int = RESAMPLES, level: float = LEVEL, seed: int = 0
-) -> tuple[F64, F64, F64]:
-    """Mean of several runs' curves, with the pointwise percentile interval over runs.
+def stretched(
+    value: float, samples: F64, means: F64, spread: Spread, bounds: tuple[float, float], level: float = LEVEL
+) -> Estimate:
+    """The percentile interval of resamples, stretched about the estimate as that of the mean has to be.
 
     Args:
-        curves: [run, point].
-        resamples: number of bootstrap samples.
+        value: the estimate.
+        samples: of it, float64 [resample].
+        means: of the mean that ``spread`` is about, in the same resamples.
+        spread: variance of that mean, and its degrees of freedom.
+        bounds: what the ends of the interval do not leave.
         level: coverage of the interval.
-        seed: of the bootstrap's random numbers.
+    """
+    if np.isnan(spread.variance):
+        return Estimate(value, float("nan"), float("nan"))
+    error, needed = means.std(), np.sqrt(spread.variance) * t_quantile(spread.freedom, level)
+    stretch = float(needed / (NormalDist().inv_cdf((1 + level) / 2) * error)) if error > 0 else 1.0
+    low, high = np.quantile(samples, [(1 - level) / 2, (1 + level) / 2])
+    ends = np.clip([value + stretch * (low - value), value + stretch * (high - value)], *bounds)
+    return Estimate(value, float(ends[0]), float(ends[1]))
+
+
+def profile_band(scores: Scores, thresholds: ArrayLike, *, level: float = LEVEL) -> tuple[F64, F64, F64]:
+    """The performance profile: share of all scores above each of the thresholds, with Wilson's intervals.
+
+    Returns:
+        Share, low and high, float64 [threshold] each.
+    """
+    above = (scores.values > np.asarray(thresholds, np.float64)[:, None, None, None]).astype(np.float64)
+    low, high = share_intervals(above, level=level)
+    return above.mean(axis=(1, 2, 3)), low, high
+
+
+def curve_band(curves: ArrayLike, *, level: float = LEVEL) -> tuple[F64, F64, F64]:
+    """Mean of several runs' curves, with the pointwise interval of Student's t over runs.
+
+    Args:
+        curves: [run, point], at least two runs.
+        level: coverage of the interval.
 
     Returns:
         Mean, low and high, float64 [point] each.
     """
-    results = np.asarray(curves, dtype=np.float64)
-    drawn = _draw(_members(None, len(results)), resamples, seed)
-    # How often each run is drawn, as a matrix: resampled means of all points are one product.
-    counts = np.stack([np.count_nonzero(drawn == run, axis=1) for run in range(len(results))], axis=1)
-    samples = counts @ results / len(results)
-    low, high = np.quantile(samples, [(1 - level) / 2, (1 + level) / 2], axis=0)
-    return results.mean(axis=0), low, high
+    results = np.asarray(curves, np.float64)
+    n = len(results)
+    average = results.mean(axis=0)
+    half = t_quantile(n - 1, level) * results.std(axis=0, ddof=1) / np.sqrt(n)
+    return average, average - half, average + half
 
 
 def episode_mean(values: ArrayLike, episodes: ArrayLike, window: int) -> F64:
@@ -273,26 +235,3 @@ def episode_mean(values: ArrayLike, episodes: ArrayLike, window: int) -> F64:
     # Episodes of one point are told apart by nothing: the window cuts through them in proportion.
     first = np.maximum(ended[1:] - window, 0.0)
     return np.asarray((total[1:] - np.interp(first, ended, total)) / (ended[1:] - first))
-
-
-def _members(strata: Sequence[object] | None, n: int) -> list[NDArray[np.int64]]:
-    """The results of each stratum, strata in order of appearance."""
-    if strata is None:
-        return [np.arange(n)]
-    if len(strata) != n:
-        raise ValueError(f"There are {n} results but {len(strata)} labels of strata.")
-    members: dict[object, list[int]] = {}
-    for result, stratum in enumerate(strata):
-        members.setdefault(stratum, []).append(result)
-    return [np.array(results) for results in members.values()]
-
-
-def _draw(members: list[NDArray[np.int64]], resamples: int, seed: int) -> NDArray[np.int64]:
-    """Results of each resample, int64 [resample, result]: Philox's raw output, as in ``rl2grid.streams``."""
-    generator = np.random.Philox(key=seed)
-    drawn = []
-    for results in members:
-        raw = generator.random_raw(resamples * len(results)).reshape(resamples, len(results))
-        uniform = (raw >> np.uint64(11)).astype(np.float64) * 2.0**-53
-        drawn.append(results[(uniform * len(results)).astype(np.int64)])
-    return np.concatenate(drawn, axis=1)

@@ -12,15 +12,23 @@ from numpy.typing import NDArray
 from rl2grid.arrays import F64
 from rl2grid.mdp.constraint_table import THRESHOLDS
 from rl2grid.records.episodes import Episode
-from rl2grid.records.statistics import Estimate, Statistic, interquartile_mean, mean, stratified_bootstrap
+from rl2grid.records.statistics import UNIT, Estimate, Scores, estimate, iqm_score
+
+BOUNDS: Mapping[str, tuple[float, float]] = {
+    "survival": UNIT,
+    "completed": UNIT,
+    **{f"cost_{name.lower()}": (0.0, np.inf) for name in THRESHOLDS},
+    "decisions": (0.0, np.inf),
+    "grid_steps": (0.0, np.inf),
+}
+"""What columns of episodes cannot leave, where they are bounded."""
 
 
 @dataclass(frozen=True)
 class Summary:
-    """Means are over episodes; their 95% intervals come from a bootstrap stratified by scenario.
+    """Means are over episodes; their 95% intervals tell how they vary with the months, draws of each included.
 
-    They tell how a mean varies with the seeds. Where every scenario was played with one seed only, there is
-    nothing to resample within a scenario: then scenarios are, and intervals tell how a mean varies with them.
+    One evaluation is of one policy: of other trainings the intervals say nothing.
     """
 
     task: str
@@ -67,7 +75,7 @@ def summarise(episodes: Sequence[Episode]) -> Summary:
     ((task, agent, heuristic),) = subjects
 
     def of(column: str) -> Estimate:
-        return _estimate(by_scenario(episodes, column), mean)
+        return estimate(column_scores([episodes], column))
 
     reasons = Counter(episode.game_over for episode in episodes if not episode.completed)
     return Summary(
@@ -78,13 +86,13 @@ def summarise(episodes: Sequence[Episode]) -> Summary:
         scenarios=len({episode.scenario for episode in episodes}),
         seeds=len({episode.seed for episode in episodes}),
         survival=of("survival"),
-        survival_iqm=_estimate(by_scenario(episodes, "survival"), interquartile_mean),
+        survival_iqm=estimate(column_scores([episodes], "survival"), iqm_score),
         completed=of("completed"),
         episode_return=of("episode_return"),
         cost_lsi=of("cost_lsi"),
         cost_tlo=of("cost_tlo"),
-        safe_lsi=_estimate(safe_episodes(episodes, {"LSI": THRESHOLDS["LSI"]}), mean),
-        safe_tlo=_estimate(safe_episodes(episodes, {"TLO": THRESHOLDS["TLO"]}), mean),
+        safe_lsi=estimate(safe_scores([episodes], "LSI")),
+        safe_tlo=estimate(safe_scores([episodes], "TLO")),
         score_margin=of("score_margin"),
         score_overload=of("score_overload"),
         score_topology=of("score_topology"),
@@ -93,6 +101,22 @@ def summarise(episodes: Sequence[Episode]) -> Summary:
         game_over=dict(sorted(reasons.items())),
         wall_time_s=sum(episode.wall_time_s for episode in episodes),
     )
+
+
+def column_scores(runs: Sequence[Sequence[Episode]], column: str) -> Scores:
+    """A column of the episodes of each run.
+
+    Raises:
+        ValueError: some scenario was not played with every seed.
+    """
+    values = np.stack([by_scenario(episodes, column) for episodes in runs])
+    return Scores(values, BOUNDS.get(column, (-np.inf, np.inf)))
+
+
+def safe_scores(runs: Sequence[Sequence[Episode]], constraint: str) -> Scores:
+    """Whether episodes of each run were completed with a cost within the threshold of a constraint."""
+    limits = {constraint: THRESHOLDS[constraint]}
+    return Scores(np.stack([safe_episodes(episodes, limits) for episodes in runs]), UNIT)
 
 
 def by_scenario(episodes: Sequence[Episode], column: str) -> F64:
@@ -125,10 +149,3 @@ def safe_episodes(episodes: Sequence[Episode], limits: Mapping[str, float]) -> F
     for constraint, limit in limits.items():
         safe &= by_scenario(episodes, f"cost_{constraint.lower()}") <= limit
     return safe.astype(np.float64)
-
-
-def _estimate(values: F64, statistic: Statistic) -> Estimate:
-    """A statistic of values [scenario, seed] and its interval; see :class:`Summary`."""
-    n_scenarios, n_seeds = values.shape
-    strata = np.repeat(np.arange(n_scenarios), n_seeds).tolist() if n_seeds > 1 else None
-    return stratified_bootstrap(values.reshape(-1), statistic, strata=strata)

@@ -1,0 +1,79 @@
+"""How far a mean over runs and months is off: variance components of a table of runs by months.
+
+Runs and months are crossed: every run plays every month. A value is
+
+    x[r, m] = mean + run[r] + month[m] + (run x month)[r, m],
+
+so that the mean over R runs and M months has the variance var(run) / R + var(month) / M + var(run x month) / (R M). The
+two last terms together are what the means of the months vary, divided by M; the first is estimated by the mean squares
+of an analysis of variance, and 0 where that would be negative. The degrees of freedom are Satterthwaite's (1946): few
+runs that vary leave few. ``benchmarks/coverage.py`` shows what intervals with these quantiles cover.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rl2grid.arrays import F64
+
+LEVEL = 0.95
+"""Coverage that intervals aim at."""
+
+
+class Spread(NamedTuple):
+    """Variance of a mean and its degrees of freedom, float64 [...] each; NaN for fewer than two months."""
+
+    variance: F64
+    freedom: F64
+
+
+def crossed_spread(by_month: F64, tables: Sequence[F64]) -> Spread:
+    """Spread of the mean over months of what was played by independent groups of runs.
+
+    Args:
+        by_month: float64 [..., month] what is averaged: means over runs, or differences of two such.
+        tables: float64 [..., run, month] of each group of runs that takes part; one run says nothing of others.
+    """
+    months = by_month.shape[-1]
+    if months < 2:
+        unknown = np.full(by_month.shape[:-1], np.nan)
+        return Spread(unknown, unknown)
+    parts = [(by_month.var(axis=-1, ddof=1) / months, months - 1)]
+    parts += [(_run_part(table), table.shape[-2] - 1) for table in tables if table.shape[-2] > 1]
+    variance = np.sum([part for part, _ in parts], axis=0)
+    squares = np.sum([part**2 / freedom for part, freedom in parts], axis=0)
+    # Without any spread there is nothing whose freedom could be missing.
+    freedom = np.where(squares > 0, variance**2 / np.where(squares > 0, squares, 1.0), months - 1.0)
+    return Spread(np.asarray(variance), freedom)
+
+
+def t_quantile(freedom: ArrayLike, level: float) -> F64:
+    """How many standard errors an interval of Student's t reaches to each side, float64 [...]."""
+    # Imported here: SciPy's special functions take longer to load than all of the records.
+    from scipy import special
+
+    return np.asarray(special.stdtrit(freedom, (1 + level) / 2), np.float64)
+
+
+def two_sided_p(value: ArrayLike, spread: Spread) -> F64:
+    """How probably Student's t is as far from 0, float64 [...]; 1 for no difference, 0 for one without spread."""
+    from scipy import special
+
+    distance, error = np.abs(np.asarray(value, np.float64)), np.sqrt(spread.variance)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = np.where(distance == 0, 0.0, distance / error)
+    return np.asarray(2 * special.stdtr(spread.freedom, -t), np.float64)
+
+
+def _run_part(table: F64) -> F64:
+    """What runs contribute to the variance of the mean over runs and months, float64 [...]."""
+    runs, months = table.shape[-2:]
+    by_run, by_month = table.mean(axis=-1), table.mean(axis=-2)
+    residuals = table - by_run[..., :, None] - by_month[..., None, :] + by_run.mean(axis=-1)[..., None, None]
+    of_runs = months * by_run.var(axis=-1, ddof=1)
+    of_both = (residuals**2).sum(axis=(-2, -1)) / ((runs - 1) * (months - 1))
+    return np.asarray(np.maximum(of_runs - of_both, 0.0) / (runs * months))
