@@ -24,6 +24,7 @@ from rl2grid.studies.search import (
     _prepare,
     _put_back_interrupted,
     best_command,
+    effort,
     one_score,
     run_tuning,
     work,
@@ -58,6 +59,9 @@ SEARCH: dict[str, Any] = {"name": "search", "algorithm": "ppo", "task": "bus14-T
             "The thresholds cannot be searched",
         ),
         ({"budget": 10}, "total_timesteps of at least"),
+        ({"seeds": []}, "a list of different whole numbers"),
+        ({"seeds": [1, 1]}, "a list of different whole numbers"),
+        ({"space": {"cost_weight": ["x"]}}, "Each choice for cost_weight must be a number"),
     ],
 )
 def test_a_bad_search_is_refused_in_one_sentence(changes: dict[str, Any], part: str):
@@ -85,6 +89,18 @@ def test_what_is_fixed_is_not_searched_by_default():
     assert not {"gamma", "num_steps", "num_envs * num_steps"} & set(tuning.space)
     assert "num_envs" in tuning.space
     assert tuning.resolved({}).num_steps == 8
+
+
+def test_weights_of_the_reward_are_searched_as_the_paper_did():
+    tuning = parse_tuning({**SEARCH, "budget": 100_000})
+    assert tuning.space["cost_weight"] == [0.1, 0.25, 0.5]
+    assert tuning.environment({}) == {"heuristic": None}
+    assert tuning.environment({"survive_weight": 0.1})["reward"] == (0.1, 0.5, 0.5)
+    fixed = parse_tuning({**SEARCH, "budget": 100_000, "hyperparameters": {"overload_weight": 1.0}})
+    assert "overload_weight" not in fixed.space
+    assert fixed.environment({"cost_weight": 0.25})["reward"] == (1.0, 1.0, 0.25)
+    assert fixed.resolved({"cost_weight": 0.25}) == fixed.resolved({})
+    assert [fixed.resolved({}, seed).seed for seed in fixed.seeds] == [1, 2, 3]
 
 
 def test_transitions_per_update_become_steps():
@@ -159,6 +175,7 @@ def test_of_equal_trials_one_is_trained_and_the_others_take_its_result(
         args.folder.mkdir(parents=True)
         trained.append(args.folder)
         time.sleep(0.5)
+        assert args.env_keywords["reward"] == (1.0, 0.1, 0.5)
         evaluate(SimpleNamespace(identity={"decisions": 256}))
         (args.folder / "metrics.csv").write_text(
             "step,grid_steps,wall_time,name,value\n256,0,0.0,validation/survival,0.5\n"
@@ -168,20 +185,30 @@ def test_of_equal_trials_one_is_trained_and_the_others_take_its_result(
     monkeypatch.setattr(runs, "is_finished", lambda folder: (folder / "metrics.csv").exists())
     monkeypatch.setattr(search_module, "validator", lambda args: lambda agent: {"survival": 0.5})
     monkeypatch.setattr(optuna.trial.Trial, "should_prune", lambda self: prune)
-    tuning = parse_tuning({**SEARCH, "trials": 3, "space": {"gamma": [0.9]}}, tmp_path)
+    file = {
+        **SEARCH,
+        "trials": 3,
+        "seeds": [4, 5],
+        "space": {"gamma": [0.9]},
+        "hyperparameters": {"overload_weight": 0.1},
+    }
+    tuning = parse_tuning(file, tmp_path)
     _prepare(tuning)
     _open(tuning)
     with ThreadPoolExecutor(2) as pool:
         list(pool.map(work, [tmp_path, tmp_path]))
-    assert len(trained) == 1
+    assert [folder.name for folder in trained] == (["4"] if prune else ["4", "5"])
     assert [trial.state.name for trial in _open(tuning).get_trials()] == [state] * 3
+    spent = 256 if prune else 512 + 256
+    assert effort(tuning) == {"trials": 3, "seeds": 2, "budget": 512, "decisions": spent}
 
 
 @pytest.mark.slow
 def test_a_search_finds_the_best_of_its_trials_and_is_gone_on_with(tmp_path: Path, monkeypatch):
     pytest.importorskip("optuna")
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([SOURCES, os.environ.get("PYTHONPATH", "")]))
-    file = {**SEARCH, "months": 1, "validations": 2, "space": {"gamma": [0.9, 0.99], "actor_layers": [[8], [8, 8]]}}
+    file = {**SEARCH, "months": 1, "validations": 2, "seeds": [1, 2]}
+    file["space"] = {"gamma": [0.9, 0.99], "actor_layers": [[8], [8, 8]]}
     tuning = parse_tuning(file, tmp_path)
     best = run_tuning(tuning, 1)
     assert best is not None
@@ -199,7 +226,8 @@ def test_a_poor_trial_is_ended_by_its_validation_survival(tmp_path: Path, monkey
     pytest.importorskip("optuna")
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([SOURCES, os.environ.get("PYTHONPATH", "")]))
     cautious, rash = 0.99, 0.001
-    file = {**SEARCH, "trials": 6, "months": 1, "validations": 2, "space": {"initial_do_nothing": [cautious, rash]}}
+    file = {**SEARCH, "trials": 6, "months": 1, "validations": 2, "seeds": [1]}
+    file["space"] = {"initial_do_nothing": [cautious, rash]}
     tuning = parse_tuning({**file, "hyperparameters": {"actor_learning_rate": 1e-6}}, tmp_path)
     # Nothing is ended before five trials are complete; equal ones cost one training.
     for choice in (*[cautious] * 5, rash):
@@ -211,19 +239,16 @@ def test_a_poor_trial_is_ended_by_its_validation_survival(tmp_path: Path, monkey
     assert [trial.state.name for trial in (*complete, pruned)] == ["COMPLETE"] * 5 + ["PRUNED"]
     assert list(pruned.intermediate_values) == [256], "it was ended half way"
     assert pruned.user_attrs["survival"] < best.survival
-    metrics = tmp_path / "trials" / pruned.user_attrs["run"] / "metrics.csv"
+    metrics = tmp_path / "trials" / pruned.user_attrs["run"] / "1" / "metrics.csv"
     assert not any(line.startswith("512,") for line in metrics.read_text().splitlines())
 
 
 ONE_TRIAL_AND_A_CRASH = """
-import json, sys
+import sys
 from pathlib import Path
-from rl2grid.envs.tasks import find_task
-from rl2grid.studies.search import _begin, _open
-from rl2grid.studies.tuning import Tuning
+from rl2grid.studies.search import _begin, _open, _read
 folder = Path(sys.argv[1])
-stored = json.loads((folder / "tuning.json").read_text())
-tuning = Tuning(**stored | {"task": find_task(stored["task"])}, output=folder)
+tuning = _read(folder)
 study = _open(tuning)
 trial, _ = _begin(tuning, study)
 trial.set_user_attr("survival", 0.5)
@@ -263,11 +288,16 @@ def test_a_trial_reports_its_best_so_far_and_what_it_reached_before_an_interrupt
     for step, survival in ((10, 0.6), (20, 0.4)):
         rows += [f"{step},0,0.0,validation/survival,{survival}", f"{step},0,0.0,losses/value_loss,9.0"]
     (tmp_path / "metrics.csv").write_text("\n".join(rows) + "\n")
-    reports = Reports(trial, tmp_path, {})
-    assert reports.best == 0.6
+    reports = Reports(trial, 50, {})
+    reports.begin(tmp_path)
+    assert reports.mean == 0.6
     with pytest.raises(optuna.TrialPruned):
         reports.add(30, {"survival": 0.5})
     reports.add(40, {"survival": 0.7})
+    reports.begin(tmp_path / "the next run")
+    reports.add(10, {"survival": 0.2})
+    reports.add(20, {"survival": 0.3})
     told = study.get_trials()[0]
-    assert told.intermediate_values == {10: 0.6, 20: 0.6, 30: 0.6, 40: 0.7}
-    assert told.user_attrs["survival"] == 0.7
+    values = {10: 0.6, 20: 0.6, 30: 0.6, 40: 0.7, 60: (0.7 + 0.2) / 2, 70: (0.7 + 0.3) / 2}
+    assert told.intermediate_values == pytest.approx(values)
+    assert told.user_attrs["survival"] == reports.mean == pytest.approx(0.5)

@@ -4,7 +4,7 @@
 
     tuning.json     what is searched
     journal.log     Optuna's journal: every trial, shared by all processes of the search
-    trials/<hash>/  one run folder per configuration
+    trials/<hash>/  one run folder per seed of a configuration
     best.json       the best configuration
 """
 

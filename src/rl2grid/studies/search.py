@@ -3,8 +3,9 @@
 A search is described by a TOML file (:mod:`rl2grid.studies.tuning`) and kept in its output folder
 (:mod:`rl2grid.records.searches`).
 
-A process may be killed at any moment. The same command goes on: a trial that was under way is put back at the head of
-the queue and its run resumed. ``python -m rl2grid.studies.search <folder>`` works on trials until there are enough.
+A trial trains one configuration with each of several seeds, one after the other; what counts is their mean. A process
+may be killed at any moment. The same command goes on: a trial that was under way is put back at the head of the queue
+and its runs resumed. ``python -m rl2grid.studies.search <folder>`` works on trials until there are enough.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from rl2grid.algorithms.policy_agent import PolicyAgent
+from rl2grid.envs.tasks import find_task
 from rl2grid.errors import UsageError
 from rl2grid.records.files import make_folder
 from rl2grid.records.locks import LockedError, is_locked
@@ -58,7 +60,7 @@ class Best:
 
     trial: int
     survival: float
-    """Of its best policy by validation; under constraints that is the one most often safe."""
+    """Mean over the seeds, of the best policies by validation; under constraints those are most often safe."""
     hyperparameters: Mapping[str, Any]
     """Those that were searched."""
 
@@ -101,7 +103,7 @@ def run_tuning(
     best = _best(tuning)
     if best is None or all(status not in (0, STOPPED) for status in statuses):
         raise UsageError(f"The search failed: {tuning.output / LOG_FILE} says why.")
-    write_best(tuning.output, asdict(best) | {"command": best_command(tuning, best)})
+    write_best(tuning.output, asdict(best) | {"command": best_command(tuning, best), "effort": effort(tuning)})
     ended = len(_ended(_open(tuning)))
     if ended < tuning.trials:
         raise UsageError(
@@ -113,17 +115,32 @@ def run_tuning(
 
 def best_command(tuning: Tuning, best: Best) -> str:
     """What to type to train with a configuration."""
-    args = run_args(tuning, tuning.resolved(best.hyperparameters), None)
+    args = run_args(tuning, best.hyperparameters, None)
     # Validated as usual: not as often as while searching, where that is for ending poor trials.
     usual = request.RunArgs
     args = replace(args, evaluate_every=usual.evaluate_every, validation_months=usual.validation_months)
     return train_command(args, tuning.preset)
 
 
+def effort(tuning: Tuning) -> dict[str, Any]:
+    """What was spent on choosing, by which searches for different algorithms are to be equal."""
+    ended = _ended(_open(tuning))
+    trained: dict[str, int] = {}
+    for trial in ended:  # of equal ones one was trained
+        run = trial.user_attrs.get("run", "refused")
+        trained[run] = max(trained.get(run, 0), *trial.intermediate_values, 0)
+    return {
+        "trials": len(ended),
+        "seeds": len(tuning.seeds),
+        "budget": tuning.budget,
+        "decisions": sum(trained.values()),
+    }
+
+
 def work(folder: Path) -> None:
     """Train trials until the search has enough of them."""
     optuna = _optuna()
-    tuning = Tuning(**(read_search(folder) or {}), output=folder)
+    tuning = _read(folder)
     study = _open(tuning)
     while (begun := _begin(tuning, study)) is not None:
         trial, chosen = begun
@@ -135,6 +152,12 @@ def work(folder: Path) -> None:
                 study.tell(trial, state=optuna.trial.TrialState.PRUNED)
             else:
                 study.tell(trial, reached)
+
+
+def _read(folder: Path) -> Tuning:
+    """The search that is stored in a folder."""
+    stored = dict(read_search(folder) or {})
+    return Tuning(**stored | {"seeds": tuple(stored["seeds"]), "task": find_task(stored["task"])}, output=folder)
 
 
 def _begin(tuning: Tuning, study: Any) -> tuple[Any, dict[str, Any]] | None:
@@ -154,20 +177,32 @@ def _begin(tuning: Tuning, study: Any) -> tuple[Any, dict[str, Any]] | None:
 
 
 def _train(tuning: Tuning, trial: Any, chosen: Mapping[str, Any]) -> float:
-    """Train one configuration; returns its best score in validation."""
+    """Train one configuration with every seed; returns the mean of their best scores in validation."""
     optuna = _optuna()
+    folder = _trial_folder(tuning, chosen)
     try:
-        hyperparameters = tuning.resolved(chosen)
+        every = [run_args(tuning, chosen, folder / str(seed), seed) for seed in tuning.seeds]
     except UsageError as error:
         trial.set_user_attr("refused", str(error))
         raise optuna.TrialPruned from None
-    folder = _trial_folder(tuning, chosen)
     trial.set_user_attr("run", folder.name)
-    args = run_args(tuning, hyperparameters, folder)
-    validate = validator(args)
-    reports = Reports(trial, folder, request.find_limits(args))
-    if _was_pruned(trial.study, folder):
+    reports = Reports(trial, tuning.budget, request.find_limits(every[0]))
+    was_pruned = _was_pruned(trial.study, folder)
+    for args in every:
+        assert args.folder is not None
+        reports.begin(args.folder)
+        if was_pruned:
+            continue
+        _train_one(args, reports)
+    if was_pruned:
         raise optuna.TrialPruned
+    return reports.mean
+
+
+def _train_one(args: request.RunArgs, reports: Reports) -> None:
+    """Train one run of a trial, or go on with it."""
+    folder, validate = args.folder, validator(args)
+    assert folder is not None
 
     def report(agent: PolicyAgent) -> Mapping[str, float]:
         result = validate(agent)
@@ -180,7 +215,6 @@ def _train(tuning: Tuning, trial: Any, chosen: Mapping[str, Any]) -> float:
         runs.resume(folder, evaluate=report)
     if not runs.is_finished(folder):
         raise KeyboardInterrupt
-    return reports.best
 
 
 def _was_pruned(study: Any, folder: Path) -> bool:
@@ -190,14 +224,29 @@ def _was_pruned(study: Any, folder: Path) -> bool:
 
 
 class Reports:
-    """What a trial tells of its course, that before an interruption included."""
+    """What a trial tells of its course, that before an interruption included: means over the runs begun so far.
 
-    def __init__(self, trial: Any, folder: Path, limits: Mapping[str, float]) -> None:
-        self._trial = trial
-        self._limits = limits
+    Args:
+        trial: Optuna's.
+        budget: decisions of a run; what run k tells after d decisions is told at k * budget + d.
+        limits: of the costs of a safe episode.
+    """
+
+    def __init__(self, trial: Any, budget: int, limits: Mapping[str, float]) -> None:
+        self._trial, self._budget, self._limits = trial, budget, limits
         self._told: set[int] = set()
-        self.best = -math.inf
-        """See :func:`one_score`."""
+        self._best: list[float] = []
+        self._survival: list[float] = []
+
+    @property
+    def mean(self) -> float:
+        """Of the best scores of the runs, see :func:`one_score`; -inf before the first."""
+        return float(np.mean(self._best)) if self._best else -math.inf
+
+    def begin(self, folder: Path) -> None:
+        """Tell of the next run from now on, and of what it has told before, if it goes on."""
+        self._best.append(-math.inf)
+        self._survival.append(0.0)
         for decisions, means in read_validations(folder).items():
             self._tell(decisions, means)
 
@@ -213,12 +262,13 @@ class Reports:
 
     def _tell(self, decisions: int, means: Mapping[str, float]) -> None:
         reached = one_score(means, self._limits)
-        if reached >= self.best:
-            self.best = reached
-            self._trial.set_user_attr("survival", float(means["survival"]))
-        if decisions not in self._told:
-            self._told.add(decisions)
-            self._trial.report(self.best, decisions)
+        if reached >= self._best[-1]:
+            self._best[-1], self._survival[-1] = reached, float(means["survival"])
+            self._trial.set_user_attr("survival", float(np.mean(self._survival)))
+        step = (len(self._best) - 1) * self._budget + decisions
+        if step not in self._told:
+            self._told.add(step)
+            self._trial.report(self.mean, step)
 
 
 def one_score(means: Mapping[str, float], limits: Mapping[str, float]) -> float:
@@ -269,7 +319,8 @@ def _put_back_interrupted(tuning: Tuning) -> None:
     for trial in study.get_trials(deepcopy=False):
         if trial.state == state.RUNNING:
             # Its process may live a little longer than the one that started it, to write a checkpoint.
-            while is_locked(tuning.output / TRIALS_FOLDER / trial.user_attrs.get("run", "none")):
+            runs_of_it = (tuning.output / TRIALS_FOLDER / trial.user_attrs.get("run", "none")).glob("*")
+            while any(is_locked(run) for run in runs_of_it):
                 time.sleep(0.2)
             study.tell(trial.number, state=state.FAIL)
             if trial.params:

@@ -60,7 +60,7 @@ _ACTIONS = {"T": "discrete", "R": "continuous"}
 
 _STUDY_KEYS = ("name", "output", "retries", "scale", "group", "slurm")
 _PRODUCT_KEYS = ("label", "algorithms", "agents", "tasks", "heuristics", "hyperparameters", "environment")
-_SETTINGS = ("split", "preset", "seeds", "budget", "validations", "months", "evaluation_seeds")
+_SETTINGS = ("split", "preset", "reward", "seeds", "budget", "validations", "months", "evaluation_seeds")
 """May stand in a group, a scale or the study, and count in this order."""
 
 
@@ -222,7 +222,8 @@ class _Group:
         for name in table:
             if name not in allowed:
                 raise unknown(f"{upper(self.where)}: environment keyword", name, allowed)
-        keywords = with_tuples(table)
+        reward = self._setting("reward", None)
+        keywords = with_tuples(table if reward is None else {"reward": reward, **table})
         try:
             TaskOptions(heuristic=heuristic, **keywords)
             resolve_reward(keywords.get("reward", "default"))

@@ -6,18 +6,27 @@ import random
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from rl2grid.algorithms.registry import Hyperparameters, algorithm_names, find_algorithm
 from rl2grid.engines import HEURISTICS
+from rl2grid.envs.options import TaskOptions
 from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
+from rl2grid.mdp.rewards import PRESETS
 from rl2grid.studies.study import NO_HEURISTIC
 from rl2grid.studies.toml_file import as_table, check_kind, count, read_toml, refuse_unknown_keys, text, unknown
 from rl2grid.training import request
 
 TRANSITIONS = "num_envs * num_steps"
 """Name of a parameter that the paper searched in place of ``num_steps``."""
+WEIGHTS = ("survive_weight", "overload_weight", "cost_weight")
+"""The paper's alpha, beta and eta: weights of the default reward's components, searched beside the hyperparameters."""
+WEIGHT_CHOICES: Mapping[str, tuple[float, ...]] = MappingProxyType(
+    {"survive_weight": (0.1, 0.5, 1.0), "overload_weight": (0.1, 0.5, 1.0), "cost_weight": (0.1, 0.25, 0.5)}
+)
+"""The paper's grid."""
 _MEASURES = ("constraints", "thresholds")
 """Hyperparameters by which runs are scored."""
 _COMBINATIONS = 1_000
@@ -30,6 +39,7 @@ _KEYS = (
     "heuristic",
     "preset",
     "seed",
+    "seeds",
     "trials",
     "budget",
     "validations",
@@ -50,8 +60,10 @@ class Tuning:
     heuristic: str | None
     preset: str
     seed: int
-    """Of the trainings and of the search. One process at a time chooses the same configurations again, interrupted or
-    not; with several, the choice depends as well on which trials have ended by then."""
+    """Of the search. One process at a time chooses the same configurations again, interrupted or not; with several,
+    the choice depends as well on which trials have ended by then."""
+    seeds: tuple[int, ...]
+    """Of the trainings of each trial, whose mean counts: one training says little of a configuration."""
     trials: int
     budget: int
     """Decisions of a training."""
@@ -60,20 +72,33 @@ class Tuning:
     months: int | None
     """How many months of the validation split are played; None: all."""
     hyperparameters: Mapping[str, Any]
-    """Changes of the preset that all trainings share."""
+    """Changes of the preset that all trainings share; :data:`WEIGHTS` may be among them."""
     space: Mapping[str, Any]
-    """By hyperparameter: a list of choices, or ``{"low": ..., "high": ..., "log": ...}``."""
+    """By hyperparameter, or one of :data:`WEIGHTS`: a list of choices, or ``{"low": ..., "high": ..., "log": ...}``."""
 
-    def resolved(self, chosen: Mapping[str, Any]) -> Hyperparameters:
+    def environment(self, chosen: Mapping[str, Any]) -> dict[str, Any]:
+        """Keywords of the environments of a trial."""
+        values = {**self.hyperparameters, **chosen}
+        usual = dict(zip(WEIGHTS, PRESETS["default"].weights, strict=True))
+        weights = tuple(float(values.get(name, usual[name])) for name in WEIGHTS)
+        reward = {"reward": weights} if any(name in values for name in WEIGHTS) else {}
+        return {"heuristic": self.heuristic, **reward}
+
+    def resolved(self, chosen: Mapping[str, Any], seed: int | None = None) -> Hyperparameters:
         """All hyperparameters of a trial.
+
+        Args:
+            chosen: what was searched.
+            seed: of the training; None: the first.
 
         Raises:
             UsageError: they cannot work together.
         """
-        changes: dict[str, Any] = {**self.hyperparameters, **chosen}
+        values = {**self.hyperparameters, **chosen}
+        changes: dict[str, Any] = {name: value for name, value in values.items() if name not in WEIGHTS}
         transitions = changes.pop(TRANSITIONS, None)
         changes = {name: tuple(value) if isinstance(value, list) else value for name, value in changes.items()}
-        fixed = {"seed": self.seed, "total_timesteps": self.budget}
+        fixed = {"seed": self.seeds[0] if seed is None else seed, "total_timesteps": self.budget}
         if transitions is not None:
             num_envs = changes.get("num_envs")
             if num_envs is None:
@@ -116,6 +141,7 @@ def parse_tuning(contents: Mapping[str, Any], output: Path | None = None) -> Tun
         heuristic=None if heuristic == NO_HEURISTIC else heuristic,
         preset=text(where, contents, "preset", "default"),
         seed=count(where, "seed", contents.get("seed", 1), 0),
+        seeds=_seeds(where, contents.get("seeds", [1, 2, 3])),
         trials=count(where, "trials", contents.get("trials", 50), 1),
         budget=count(where, "budget", contents.get("budget", 200_000), 1),
         validations=count(where, "validations", contents.get("validations", 10), 1),
@@ -131,9 +157,15 @@ def parse_tuning(contents: Mapping[str, Any], output: Path | None = None) -> Tun
     return tuning
 
 
+def _seeds(where: str, seeds: Any) -> tuple[int, ...]:
+    if not isinstance(seeds, list | tuple) or not seeds or len(set(map(str, seeds))) != len(seeds):
+        raise UsageError(f"The seeds of {where} must be a list of different whole numbers such as [1, 2, 3].")
+    return tuple(count(where, "seeds", seed, 0) for seed in seeds)
+
+
 def search_space(algorithm: str) -> dict[str, list[Any]]:
-    """The paper's grid for an algorithm (its table of hyperparameters)."""
-    return {name: list(values) for name, values in find_algorithm(algorithm).search_space.items()}
+    """The paper's grid for an algorithm (its table of hyperparameters), weights of the reward included."""
+    return {name: list(values) for name, values in {**find_algorithm(algorithm).search_space, **WEIGHT_CHOICES}.items()}
 
 
 def _default_space(algorithm: str, fixed: Mapping[str, Any]) -> dict[str, list[Any]]:
@@ -142,14 +174,20 @@ def _default_space(algorithm: str, fixed: Mapping[str, Any]) -> dict[str, list[A
     return {name: values for name, values in search_space(algorithm).items() if name not in without}
 
 
-def run_args(tuning: Tuning, hyperparameters: Hyperparameters, folder: Path | None) -> request.RunArgs:
-    """The training of a trial, in ``folder``; None: the usual one."""
+def run_args(
+    tuning: Tuning, chosen: Mapping[str, Any], folder: Path | None, seed: int | None = None
+) -> request.RunArgs:
+    """A training of a trial, in ``folder``; None: the usual one.
+
+    Raises:
+        UsageError: the choices cannot work together.
+    """
     return request.RunArgs(
         task=tuning.task,
-        hyperparameters=hyperparameters,
+        hyperparameters=tuning.resolved(chosen, seed),
         algorithm=tuning.algorithm,
         folder=folder,
-        env_keywords={"heuristic": tuning.heuristic},
+        env_keywords=tuning.environment(chosen),
         num_threads=1,
         evaluate_every=max(tuning.budget // tuning.validations, 1),
         validation_months=tuning.months,
@@ -186,7 +224,7 @@ def _check_space(tuning: Tuning) -> None:
 
 def kinds_of(tuning: Tuning) -> dict[str, Any]:
     """Type hint of every name that a search may hold."""
-    return {**find_algorithm(tuning.algorithm).type_hints(), TRANSITIONS: int}
+    return {**find_algorithm(tuning.algorithm).type_hints(), TRANSITIONS: int, **dict.fromkeys(WEIGHTS, float)}
 
 
 def _choices(name: str, values: Any) -> list[Any]:
@@ -221,7 +259,9 @@ def _check_choices(tuning: Tuning) -> None:
 def _refusal(tuning: Tuning, chosen: Mapping[str, Any]) -> UsageError | None:
     """Why a configuration cannot be trained; None if it can."""
     try:
-        request.find_limits(run_args(tuning, tuning.resolved(chosen), None))
+        args = run_args(tuning, chosen, None)
+        request.find_limits(args)
+        TaskOptions(**args.env_keywords)
     except UsageError as error:
         return error
     return None
