@@ -54,7 +54,8 @@ from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.engines.native.what_if import WhatIf, snapshot_of
 from rl2grid.errors import UsageError, one_of
 from rl2grid.grids import Grid, find_system, load_grid
-from rl2grid.mdp.actions import DO_NOTHING, ActionCatalogue, ActionKind, StepAction, full_catalogue
+from rl2grid.mdp.actions import DO_NOTHING, ActionCatalogue, ActionKind, StepAction, full_catalogue, one_change
+from rl2grid.mdp.heuristics import is_safe, recovery_action
 from rl2grid.powerflow.batch import Snapshot
 from rl2grid.records.files import make_folder
 from rl2grid.scenarios.episodes import plan_episode
@@ -76,7 +77,7 @@ _SHARES = {"stressed": 0.7, "near": 0.15, "calm": 0.15}
 _PER_EPISODE = {"stressed": 6, "near": 2, "calm": 2}
 _EPISODE_STEPS = 2016  # a week
 _EPISODES_PER_YEAR = 4  # making a year takes longer than playing a week of it
-_POLICIES = ("nothing", "greedy", "disturbed")
+_POLICIES = ("nothing", "recovering", "greedy", "recovering", "disturbed", "recovering")
 _TRIED_BY_GREEDY = 1000
 _COVERED, _WORTHWHILE = 0.9, 0.02
 _TRUST, _RELIEF_WEIGHT = 0.7, 0.001
@@ -447,12 +448,14 @@ def _kind(state: Any) -> str:
 
 
 def _policy_action(laboratory: _Laboratory, policy: str, kind: str, draws: Stream) -> StepAction:
-    """What a policy plays: nothing; the best of some actions when stressed; or that with disturbances.
+    """What a policy plays: nothing; the best of some actions when stressed, also with disturbances, or behind recovery.
 
     A disturbance is a random action that does no harm at once.
     """
     whim, pick = draws.uniform(2)
     disturb = policy == "disturbed" and whim < (0.2 if kind == "stressed" else 0.02)
+    if policy == "recovering" and is_safe(laboratory.engine.state, 0):
+        return one_change(*recovery_action(laboratory.engine.state, 0))
     if policy == "nothing" or not (disturb or kind == "stressed"):
         return DO_NOTHING
     catalogue = laboratory.catalogue
