@@ -2,7 +2,8 @@
 
 ``python benchmarks/scenarios.py calibrate [GRID ...]`` writes ``src/rl2grid/scenarios/generator/data/<grid>.json``.
 ``measure [GRID ...] --seeds N`` plays N generated months doing nothing, ``compare [GRID ...]`` sets generated against
-bundled series; both write ``benchmarks/results/scenarios.json``. ``plot [GRID ...] --folder F`` draws a year.
+bundled series, ``outages [GRID ...]`` does so after the loss of each line that opponent or planned outages open; all
+write ``benchmarks/results/scenarios.json``. ``plot [GRID ...] --folder F`` draws a year.
 Seeds begin at 10,000: no split uses those.
 """
 
@@ -17,14 +18,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rl2grid.arrays import F64
+from rl2grid.arrays import F32, F64, I32
 from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.engines.native.entry import reset_one, step_one
 from rl2grid.engines.native.orders import write_order
 from rl2grid.engines.native.series import outages_of
+from rl2grid.engines.native.what_if import WhatIf
 from rl2grid.grids import GRID_IDS, Grid, find_system, load_grid
 from rl2grid.mdp.actions import DO_NOTHING
 from rl2grid.mdp.opponents import draw_opponent
+from rl2grid.powerflow.batch import NOTHING, SWITCH, Changes, Snapshot
+from rl2grid.powerflow.model import load_network
 from rl2grid.scenarios.bundled import bundled_folders
 from rl2grid.scenarios.generator import generate_month
 from rl2grid.scenarios.generator.calendar import (
@@ -51,6 +55,8 @@ KINDS = ("nuclear", "hydro", "thermal", "wind", "solar")
 DATA = Path(__file__).resolve().parents[1] / "src" / "rl2grid" / "scenarios" / "generator" / "data"
 RESULTS = Path(__file__).resolve().parent / "results" / "scenarios.json"
 FIRST_SEED = 10_000
+OUTAGE_YEARS = 12
+"""Generated years that are set against the bundled series after the loss of lines."""
 SEASON_MONTHS = {"winter": (0, 1, 11), "spring": (2, 3, 4), "summer": (5, 6, 7), "autumn": (8, 9, 10)}
 
 BUS36 = ("bus36-M", "bus36-MO-v0", "bus36-MO-v1")
@@ -462,6 +468,92 @@ def compare(grid_id: str, seeds: int) -> dict[str, Any]:
     return {"bundled": _describe(grid, constants, real), "generated": _describe(grid, constants, made)}
 
 
+def outages(grid_id: str, years: int) -> dict[str, Any]:
+    """Worst loading after the loss of each line that opponent or planned outages open, one at a time.
+
+    One row an hour, in the reference topology otherwise. Beside every bundled day are those of the same weekday in the
+    same month of 28 days of the generated years: most bundled series are of one to three days, working days or Sundays.
+    """
+    grid = load_grid(grid_id)
+    lines, own = opened_lines(grid), bundled(grid)
+    real = [_after_losses(grid, lines, s.load_p, s.load_q, s.prod_p, voltage_of(grid, s)) for s in own]
+    days = np.concatenate([days_of_year(s) for s in own])
+    made = []
+    for number in range(years):
+        year = generate_year(grid, FIRST_SEED + number)
+        beside = {}
+        for day in {int(day) for each in days for day in _days_beside(each)}:
+            rows = slice(day * ROWS_PER_DAY, (day + 1) * ROWS_PER_DAY)
+            megawatt = [array[rows].astype(np.float32) / np.float32(10) for array in year[:3]]
+            beside[day] = _after_losses(grid, lines, *megawatt, voltage_of(grid, own[0]))
+        made += [beside[int(day)] for each in days for day in _days_beside(each)]
+    worst = {"bundled": np.concatenate(real), "generated": np.concatenate(made)}
+    medians = {source: float(np.median(loading[:, 1:])) for source, loading in worst.items()}
+    return {
+        "days": {"bundled": len(days), "generated": len(made)},
+        "pooled": {source: _loadings(loading[:, 1:]) for source, loading in worst.items()},
+        "pooled_median_ratio": round(medians["generated"] / medians["bundled"], 3),
+        "without_loss": {source: _loadings(loading[:, 0]) for source, loading in worst.items()},
+        "lines": {
+            str(line): {source: _loadings(loading[:, k + 1]) for source, loading in worst.items()}
+            for k, line in enumerate(lines)
+        },
+    }
+
+
+def days_of_year(scenario: Scenario) -> NDArray[np.int64]:
+    """The days, counted from January 1st, of which a series has more than half."""
+    start = scenario.start_datetime
+    middle = start.hour * ROWS_PER_HOUR + start.minute // 5 + ROWS_PER_DAY // 2
+    days = (middle + np.arange(scenario.n_rows - ROWS_PER_DAY // 2)[::ROWS_PER_DAY]) // ROWS_PER_DAY
+    return np.asarray(start.timetuple().tm_yday - 1 + days, np.int64)
+
+
+def _days_beside(day: int) -> NDArray[np.int64]:
+    """[4] the days of the same weekday in the month of 28 days that holds a day of the year."""
+    return min(day // 28, MONTHS - 1) * 28 + day % 7 + 7 * np.arange(4)
+
+
+def opened_lines(grid: Grid) -> list[int]:
+    """The lines that opponent or planned outages of generated months open."""
+    attacked = {line for area in grid.opponent.areas for line in area}
+    return sorted(attacked | set(find_system(grid.id).scenarios.maintenance(grid, "generated").lines))
+
+
+def voltage_of(grid: Grid, scenario: Scenario) -> F32:
+    """[gen] voltage set-points of a series, per unit; bundled ones keep theirs."""
+    network = load_network(grid)
+    voltage = network.gen_setpoint if scenario.prod_v is None else scenario.prod_v[0] / network.gen_kilovolt
+    return np.asarray(voltage, np.float32)
+
+
+def _after_losses(grid: Grid, lines: list[int], load_p: F32, load_q: F32, prod_p: F32, voltage: F32) -> F32:
+    """[hour, 1 + line] worst loading without and with the loss of each line; inf where there is no flow."""
+    solver, everything = WhatIf(grid), np.ones(grid.dim_topo, np.int32)
+    chosen: I32 = np.array(lines, np.int32)
+    idle, loading = np.zeros(grid.n_line, np.int32), []
+    for row in range(0, len(load_p), ROWS_PER_HOUR):
+        snapshot = Snapshot(
+            *(everything, everything, idle, np.zeros(grid.n_sub, np.int32), prod_p[row], voltage),
+            *(load_p[row], load_q[row], np.zeros(grid.n_storage, np.float32)),
+        )
+        # A change of no line: what is loaded without a loss.
+        kind = np.array([NOTHING] + [SWITCH] * len(lines), np.int8)
+        target = np.concatenate([[0], chosen]).astype(np.int32)
+        loading.append(solver.solve(snapshot, Changes(kind, target, np.zeros((len(kind), 1), np.uint64))).worst_loading)
+    return np.array(loading)
+
+
+def _loadings(worst: F32) -> dict[str, float]:
+    return {
+        "median": round(float(np.median(worst)), 3),
+        "p90": round(float(np.quantile(worst, 0.9, method="higher")), 3),
+        "above_1": round(float((worst > 1).mean()), 4),
+        "above_1.5": round(float((worst > 1.5).mean()), 4),
+        "no_flow": round(float(np.isinf(worst).mean()), 4),
+    }
+
+
 def _describe(grid: Grid, constants: Constants, series: list[Any]) -> dict[str, Any]:
     kinds = np.array(grid.gen_type)
     demand = [p.sum(axis=1) / 10 for p, _, _ in series]
@@ -541,7 +633,7 @@ def record(section: str, grid_id: str, value: dict[str, Any]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("command", choices=("calibrate", "measure", "compare", "plot"))
+    parser.add_argument("command", choices=("calibrate", "measure", "compare", "outages", "plot"))
     parser.add_argument("grids", nargs="*", default=list(GRID_IDS))
     parser.add_argument("--seeds", type=int, default=200)
     parser.add_argument("--folder", type=Path, default=Path("plots"))
@@ -555,6 +647,8 @@ def main() -> None:
             record("difficulty", grid_id, measure(grid_id, arguments.seeds))
         elif arguments.command == "compare":
             record("realism", grid_id, compare(grid_id, min(arguments.seeds, 6)))
+        elif arguments.command == "outages":
+            record("outages", grid_id, outages(grid_id, min(arguments.seeds, OUTAGE_YEARS)))
         else:
             plot(grid_id, FIRST_SEED, arguments.folder)
 
