@@ -36,7 +36,7 @@ from rl2grid.streams import Purpose, Stream
 if TYPE_CHECKING:
     from rl2grid.scenarios.generator.month import RawMonth
 
-VERSION = "1"
+VERSION = "2"
 """Version of the generator, named by every result on generated months: it changes with any value that is generated.
 The hashes of the months of validation and test are published with it (:mod:`rl2grid.scenarios.published`)."""
 

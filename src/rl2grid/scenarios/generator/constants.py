@@ -32,7 +32,8 @@ class DemandConstants(NamedTuple):
     fast: F64  # [load] standard deviation that lasts hours, MW; 0 for ordinary loads
     low: F64  # [load] bounds of interconnections, MW
     high: F64  # [load]
-    absorb: F64  # [load] MW that interconnections take of every MW of surplus; 0 for ordinary loads
+    absorb: F64  # [load] MW that interconnections take of every MW of surplus, over the year; 0 for ordinary loads
+    absorbing: F64  # [12] factor on that in the middle of each calendar month
     surplus: F64  # [12] MW of wind and sun less ordinary demand, usual in the middle of each calendar month
 
 

@@ -121,7 +121,7 @@ def _fill(
             random = known.noise[0] * to_gaussian(noise[k, load])
             active[k, load] = rounded(10.0 * known.base[load] * habit * weather * (1.0 + random))
             surplus -= active[k, load]
-        unusual = surplus / 10.0 - seasonal(known.surplus, row)
+        unusual = (surplus / 10.0 - seasonal(known.surplus, row)) * seasonal(known.absorbing, row)
         for load in range(active.shape[1]):
             if known.base[load] > 0.0:
                 continue

@@ -26,7 +26,7 @@ _KEPT_PACE = 0.8
 """Share of their ramps at which thermal units are expected to climb before a peak; some may be at their most."""
 _PASSES = 6
 """How often rows are dispatched at most, each time with more reserve."""
-_MORE_RESERVE = 50
+_MORE_RESERVE = 1500
 """Reserve beyond what was missing, 0.1 MW."""
 _LOWEST_PRICE, _HIGHEST_PRICE = -2.0, 6.0
 _HALVINGS = 34

@@ -103,11 +103,11 @@ def _fill_sun(weather: Weather, first: int, production: I32) -> None:
         row = first + k
         sine_tilt = -_SINE_TILT * sine(row / (365.0 * ROWS_PER_DAY) + 10.0 / 365.0 + 0.25)
         cosine_tilt = np.sqrt(1.0 - sine_tilt * sine_tilt)
-        noon = sine((row % ROWS_PER_DAY) / ROWS_PER_DAY - 12.5 / 24.0 + 0.25)
+        noon = sine((row % ROWS_PER_DAY) / ROWS_PER_DAY - 0.5 + 0.25)
         elevation = _SINE_LATITUDE * sine_tilt + _COSINE_LATITUDE * cosine_tilt * noon
         if elevation <= 0.0:
             continue
-        clear = weather.solar * elevation * np.sqrt(np.sqrt(elevation))
+        clear = weather.solar * np.sqrt(elevation) * np.sqrt(np.sqrt(elevation))
         for sun in range(weather.suns.size):
             sky = 0.75 + 0.12 * value(weather.cloud_day, row, sun) + 0.06 * value(weather.cloud_hours, row, sun)
             share = min(clear * min(max(sky, 0.08), 1.05), _MOST)
