@@ -42,12 +42,16 @@ def crossed_spread(by_month: F64, tables: Sequence[F64]) -> Spread:
     if months < 2:
         unknown = np.full(by_month.shape[:-1], np.nan)
         return Spread(unknown, unknown)
-    parts = [(by_month.var(axis=-1, ddof=1) / months, months - 1)]
-    parts += [(_run_part(table), table.shape[-2] - 1) for table in tables if table.shape[-2] > 1]
-    variance = np.sum([part for part, _ in parts], axis=0)
-    squares = np.sum([part**2 / freedom for part, freedom in parts], axis=0)
-    # Without any spread there is nothing whose freedom could be missing.
+    of_months = by_month.var(axis=-1, ddof=1) / months
+    variance, squares = of_months, of_months**2 / (months - 1)
+    for table in tables:
+        if table.shape[-2] > 1:
+            part, whole = _run_part(table)
+            variance = variance + part
+            squares = squares + np.where(part > 0, whole, 0.0) ** 2 / (table.shape[-2] - 1)
+    # Without any spread there is nothing whose freedom could be missing; with some, the fewest runs have theirs.
     freedom = np.where(squares > 0, variance**2 / np.where(squares > 0, squares, 1.0), months - 1.0)
+    freedom = np.maximum(freedom, min([months, *(table.shape[-2] for table in tables if table.shape[-2] > 1)]) - 1)
     return Spread(np.asarray(variance), freedom)
 
 
@@ -69,11 +73,14 @@ def two_sided_p(value: ArrayLike, spread: Spread) -> F64:
     return np.asarray(2 * special.stdtr(spread.freedom, -t), np.float64)
 
 
-def _run_part(table: F64) -> F64:
-    """What runs contribute to the variance of the mean over runs and months, float64 [...]."""
+def _run_part(table: F64) -> tuple[F64, F64]:
+    """What runs contribute to the variance of the mean over runs and months, and what it was found in, float64 [...].
+
+    The part is as uncertain as the whole mean square of the runs, from which what chance explains was subtracted.
+    """
     runs, months = table.shape[-2:]
     by_run, by_month = table.mean(axis=-1), table.mean(axis=-2)
     residuals = table - by_run[..., :, None] - by_month[..., None, :] + by_run.mean(axis=-1)[..., None, None]
     of_runs = months * by_run.var(axis=-1, ddof=1)
     of_both = (residuals**2).sum(axis=(-2, -1)) / ((runs - 1) * (months - 1))
-    return np.asarray(np.maximum(of_runs - of_both, 0.0) / (runs * months))
+    return np.maximum(of_runs - of_both, 0.0) / (runs * months), of_runs / (runs * months)
