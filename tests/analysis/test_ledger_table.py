@@ -3,19 +3,100 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
-from rl2grid.analysis.ledger_table import ledger_table
-from rl2grid.records.ledger import read_ledger
+import pytest
+from sample_results import TASK, result
+
+from rl2grid.analysis.ledger_table import LEGEND, ledger_table
+from rl2grid.errors import UsageError
+from rl2grid.records.evaluations import identity_hash
+from rl2grid.records.ledger import HashedTest, hashed_test, read_ledger
 
 ROOT = Path(__file__).parents[2]
+MONTHS = {"split": "test", "split_version": "2", "generator_version": "1"}
+
+
+def untrained(agent: str, survivals: list[float]) -> HashedTest:
+    configuration = {"agent": agent, "task": TASK, "heuristic": None}
+    return hashed_test(configuration, {}, result(agent, [[one] for one in survivals], **MONTHS))
+
+
+def trained(seed: int, survivals: list[float], last: list[float] | None = None, **changes: Any) -> HashedTest:
+    configuration = {"algorithm": "ppo", "task": TASK, "hyperparameters": {"seed": seed}, "targets_version": 2}
+    configuration |= {"env_keywords": {"heuristic": "idle"}}
+    training = {"grid_steps": 5_000_000, "minutes": 3.0, "validation_survival": 0.75, "decisions": 1000}
+    training |= {name: changes.pop(name) for name in ("decisions", "tested_before") if name in changes}
+    played = [
+        None if values is None else result("ppo", [[one] for one in values], "idle", **MONTHS)
+        for values in (survivals, last)
+    ]
+    assert played[0] is not None
+    return hashed_test({**configuration, **changes}, training, played[0], played[1])
+
+
+def ledger(*results: HashedTest) -> dict[str, HashedTest]:
+    return {identity_hash(one.configuration): one for one in results}
+
+
+def cells(table: str, start: str) -> dict[str, str]:
+    lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines() if "|" in line]
+    (row,) = [line for line in lines if " ".join(line).startswith(start)]
+    return dict(zip(lines[0], row, strict=True))
 
 
 def test_the_table_of_the_documentation_is_the_ledger():
-    table = ledger_table(read_ledger(ROOT / "benchmarks" / "results" / "baselines.json").values())
-    assert table in (ROOT / "docs" / "results.md").read_text()
+    table = ledger_table(read_ledger(ROOT / "benchmarks" / "results" / "baselines.json"))
+    assert table.splitlines()[:-2] == [
+        line for line in (ROOT / "docs" / "results.md").read_text().splitlines() if line.startswith("|")
+    ]
 
 
-def test_seeds_stand_together_with_their_mean():
-    table = ledger_table(read_ledger(ROOT / "benchmarks" / "results" / "baselines.json").values())
-    (row,) = [line for line in table.splitlines() if line.startswith("| bus14-T0 | sac | recovery")]
-    assert "**0.961** of 0.952, 0.954, 0.978" in row
+def test_seeds_stand_together_and_are_compared_on_the_same_months():
+    table = ledger_table(
+        ledger(
+            untrained("do-nothing", [0.1, 0.2, 0.3, 0.4]),
+            trained(1, [0.6, 0.6, 0.8, 1.0], last=[0.2, 0.3, 0.3, 0.4]),
+            trained(2, [0.5, 0.7, 0.8, 1.0]),
+        )
+    )
+    row = cells(table, "bus14-T0 ppo idle")
+    assert row["months"] == "4 (list 2)"
+    assert row["decisions (grid steps)"] == "1,000 (5.0 M)"
+    assert row["test survival"].startswith("**0.750 [")
+    assert row["test survival"].endswith("]** of 0.750, 0.750")
+    assert row["last"] == "0.525"  # 0.3 and, where the last is the best, 0.75
+    assert row["to do-nothing"].startswith("+0.500 [+0.")
+    assert float(row["p"].removeprefix("< ")) < 0.01
+    assert row["completed"].startswith("25% [")
+    assert row["marks"] == ""
+    assert cells(table, "bus14-T0 do-nothing")["completed"] == "0% [0, 49]"
+    assert table.endswith(LEGEND.format(heading="To do-nothing"))
+
+
+def test_what_cannot_be_compared_is_marked():
+    other = trained(1, [0.5, 0.5], network="graph", decisions=5000)
+    results = ledger(
+        untrained("do-nothing", [0.1, 0.2]),
+        trained(1, [0.6, 0.8]),
+        trained(2, [0.6, 0.9]),
+        other,
+        trained(1, [0.7, 0.8], network="mlp", targets_version=1, tested_before=True),
+    )
+    rows = [line.split("|")[-2].strip() for line in ledger_table(results).splitlines() if "| ppo |" in line]
+    assert sorted(rows) == ["", "a1 b", "a2 s t"]
+    to_ppo = ledger_table(results, TASK, "ppo + idle")
+    assert to_ppo.count("other budget") >= 1
+
+
+def test_tests_of_an_earlier_list_are_shown_without_comparison():
+    table = ledger_table(read_ledger(ROOT / "benchmarks" / "results" / "baselines.json"))
+    row = cells(table, "bus14-T0 sac recovery")
+    assert row["test survival"] == "**0.961** of 0.952, 0.954, 0.978"
+    assert (row["to do-nothing"], row["p"], row["marks"]) == ("", "", "b t v")
+
+
+def test_an_unknown_reference_is_refused():
+    results = ledger(untrained("do-nothing", [0.1, 0.2]))
+    with pytest.raises(UsageError, match="Reference 'greedy' does not exist: choose one of do-nothing"):
+        ledger_table(results, TASK, "greedy")

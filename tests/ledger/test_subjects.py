@@ -10,10 +10,12 @@ import pytest
 from sample_results import result
 
 from rl2grid.cli.main import main
+from rl2grid.envs.tasks import Task
 from rl2grid.errors import UsageError
 from rl2grid.ledger import subjects
 from rl2grid.ledger.subjects import find_subject, play_test
 from rl2grid.records.ledger import read_ledger
+from rl2grid.scenarios.splits import SPLIT_VERSION
 
 
 @pytest.fixture
@@ -21,9 +23,10 @@ def played(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     """What was asked of the protocol, which answers with a made-up evaluation."""
     asked: list[dict[str, Any]] = []
 
-    def evaluate(agent: str, task: str, **options: Any):
+    def evaluate(agent: str, task: Task, **options: Any):
         asked.append({"agent": agent, "task": task, **options})
-        return result(agent, [[0.5], [1.0]], options["heuristic"])
+        months = {"split": "test", "split_version": SPLIT_VERSION, "generator_version": "1"}
+        return result(agent, [[0.5], [1.0]], options["heuristic"], task=task.id, **months)
 
     monkeypatch.setattr(subjects, "evaluate", evaluate)
     return asked
@@ -31,10 +34,15 @@ def played(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
 
 def test_an_agent_without_training_is_named_with_its_task(played):
     subject = find_subject("random@bus14-T0:idle")
-    assert subject.configuration == {"agent": "random", "task": "rl2grid/bus14-T0-v0", "heuristic": "idle"}
-    assert subject.digest == "21bd7f217588a3cd"  # as it stands in the ledger of the baselines
+    who = {"agent": "random", "task": "rl2grid/bus14-T0-v0", "heuristic": "idle"}
+    assert subject.configuration == {**who, "test": {"split_version": SPLIT_VERSION, "months": 500}}
     play_test(subject)
     assert (played[0]["split"], played[0]["heuristic"]) == ("test", "idle")
+    assert len(played[0]["scenarios"]) == 500
+    few = find_subject("random@bus14-T0:idle", months=3)
+    assert few.digest != subject.digest
+    play_test(few)
+    assert played[1]["scenarios"] == played[0]["scenarios"][:3]
     with pytest.raises(UsageError, match="Task"):
         find_subject("random@bus15-T0")
 
@@ -46,12 +54,16 @@ def test_a_configuration_is_tested_once_and_verified_as_often_as_asked(played, t
     before = ledger.read_bytes()
     assert main(["leaderboard", "test", *words]) == 0
     assert len(played) == 1
-    assert "has had its test: see ledger.json." in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert f"Look 1 of 100 at the test months of bus14, version {SPLIT_VERSION}.\n" in shown
+    assert "has had its test: see ledger.json." in shown
     assert main(["leaderboard", "verify", *words]) == 0
     assert capsys.readouterr().out == "greedy on bus14-T0, heuristic None: the same, bit for bit.\n"
     assert ledger.read_bytes() == before
-    assert main(["leaderboard", "table", "--ledger", str(ledger)]) == 0
+    assert main(["leaderboard", "table", "--ledger", str(ledger), "--task", "bus14-T0", "--to", "greedy"]) == 0
     assert "| bus14-T0 | greedy | none |" in capsys.readouterr().out
+    assert main(["leaderboard", "table", "--ledger", str(ledger), "--to", "random"]) == 2
+    assert "Reference 'random' does not exist: choose one of greedy." in capsys.readouterr().err
     assert len(read_ledger(ledger)) == 1
 
 
@@ -68,6 +80,15 @@ def test_what_differs_is_named(played, tmp_path: Path, capsys):
     assert "differs in episodes_hash, test." in capsys.readouterr().out
     assert main(["leaderboard", "verify", "random@bus14-T0", "--ledger", str(ledger)]) == 2
     assert "The ledger has no test of 'random'" in capsys.readouterr().err
+
+
+def test_a_list_is_used_up(played, tmp_path: Path, capsys, monkeypatch):
+    monkeypatch.setattr(subjects, "LOOKS", 1)
+    words = ["--ledger", str(tmp_path / "ledger.json"), "--months", "2"]
+    assert main(["leaderboard", "test", "greedy@bus14-T0", "greedy@bus36-M-T0", *words]) == 0
+    assert main(["leaderboard", "test", "greedy@bus14-R", *words]) == 2
+    assert f"The test months of bus14, version {SPLIT_VERSION} are used up: 1 conf" in capsys.readouterr().err
+    assert len(played) == 2
 
 
 def test_what_is_no_finished_run_has_no_test(tmp_path: Path):

@@ -1,71 +1,218 @@
-"""The ledger of test results as a table: a row per configuration, its seeds together."""
+"""The ledger of test results as a table: a row per configuration, its seeds together, compared on the same months."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
-from rl2grid.envs.tasks import short_id
-from rl2grid.records.evaluations import identity_hash
-from rl2grid.records.ledger import HashedTest
+import numpy as np
 
+from rl2grid.analysis.table import difference_cell, markdown_row, p_cell, share_text, with_interval
+from rl2grid.envs.tasks import short_id
+from rl2grid.errors import one_of
+from rl2grid.mdp.constraint_table import CONSTRAINTS, THRESHOLDS
+from rl2grid.records.comparisons import Difference, holm, paired_differences
+from rl2grid.records.ledger import HashedTest
+from rl2grid.records.looks import budget, earlier_choices, method_of
+from rl2grid.records.month_values import common_months, unpack_months
+from rl2grid.records.statistics import UNIT, Scores, estimate
+from rl2grid.records.versions import TARGETS_VERSION
+
+REFERENCE = "do-nothing"
+"""What rows are compared with unless another is named, where it has had its test."""
+LEGEND = (
+    "Test survival: mean over seeds and months, 95% interval over both; of one training, or none, over months alone. "
+    "Last: of the last policies of the runs, where they are not the best by validation. {heading}: paired difference "
+    "on the same months; p: that there is none, Holm's correction over the rows of the task. Completed and safe: "
+    "shares of months, with Wilson's intervals. Marks: a, entered after other configurations of the same agent and "
+    "heuristic had had their test on these months (their number); b, another budget (decisions, validations, months of "
+    "each) than most trained rows of the task with that heuristic; s, a run that had been evaluated on test months "
+    "before; t, trained with targets of an earlier version; v, of an earlier list, of whose months nothing is kept."
+)
 _HEADINGS = (
     "task",
     "agent",
     "heuristic",
+    "months",
     "decisions (grid steps)",
     "minutes",
     "validation",
     "test survival",
+    "last",
+    "{heading}",
+    "p",
     "completed",
     "cost TLO",
     "P(TLO safe)",
     "P(LSI safe)",
+    "marks",
 )
-_TESTED = {"completed": ".0%", "cost_tlo": ".0f", "safe_tlo": ".0%", "safe_lsi": ".0%"}
 
 
-def ledger_table(results: Iterable[HashedTest]) -> str:
-    """Results as Markdown: tasks in order, trained agents last, the seeds of one configuration in one row."""
-    lines = ["| " + " | ".join(_HEADINGS) + " |", "|" + "---|" * len(_HEADINGS)]
-    for _, group in itertools.groupby(sorted(results, key=_place), key=lambda result: _place(result)[:-1]):
-        lines.append("| " + " | ".join(_cells(list(group))) + " |")
-    return "\n".join(lines)
+@dataclass(frozen=True)
+class _Row:
+    """One configuration with all its seeds."""
+
+    results: tuple[HashedTest, ...]
+    marks: str
+
+    @property
+    def first(self) -> HashedTest:
+        return self.results[0]
+
+    @property
+    def has_values(self) -> bool:
+        return all(result.values for result in self.results)
+
+    def scores(self, column: str, months: int | None = None, *, of_last: bool = False) -> Scores:
+        """A column of the tests, seeds of the training as runs; the first ``months`` of them."""
+        seeds = int(self.first.months["seeds"])
+        columns = [one.last if of_last and one.last else one.values for one in self.results]
+        values = [unpack_months(one, seeds)[column][:months] for one in columns]
+        return Scores(np.stack(values), UNIT if column in ("survival", "completed") else (0.0, np.inf))
+
+    def safe(self, constraint: str) -> Scores:
+        """Whether a month was completed within the threshold of a constraint."""
+        costs = self.scores(CONSTRAINTS[constraint].column).values
+        return Scores(self.scores("completed").values * (costs <= THRESHOLDS[constraint]), UNIT)
+
+
+def ledger_table(results: Mapping[str, HashedTest], task: str | None = None, reference: str | None = None) -> str:
+    """Results as Markdown with a legend: tasks in order, trained agents last, seeds of one configuration in one row.
+
+    Args:
+        results: of a ledger.
+        task: id of the task whose rows are shown; None: all.
+        reference: agent and heuristic, as in ``greedy + recovery``, that the rows of each task are compared with; None:
+            doing nothing.
+
+    Raises:
+        UsageError: no row of the ledger has that name.
+    """
+    shown = {digest: one for digest, one in results.items() if task in (None, one.task)}
+    labels = sorted({one.label for one in shown.values()})
+    if reference is not None and reference not in labels:
+        raise one_of("Reference", reference, labels)
+    reference = reference or REFERENCE
+    heading = f"to {reference}"
+    rows = _rows(shown, results)
+    compared = _compared(rows, reference)
+    names = [name.format(heading=heading) for name in _HEADINGS]
+    lines = [markdown_row(names), "|" + "---|" * len(names)]
+    lines += [markdown_row(_cells(row, compared.get(number))) for number, row in enumerate(rows)]
+    return "\n".join([*lines, "", LEGEND.format(heading=heading.capitalize())])
+
+
+def _rows(shown: Mapping[str, HashedTest], results: Mapping[str, HashedTest]) -> list[_Row]:
+    groups = [list(group) for _, group in itertools.groupby(sorted(shown.values(), key=_place), key=_choice)]
+    budgets: dict[tuple[str, Any], Counter[tuple[Any, ...]]] = {}
+    for first, *_ in groups:
+        if first.training:
+            budgets.setdefault((first.task, first.heuristic), Counter())[budget(first)] += 1
+    usual = {key: counts.most_common(1)[0][0] for key, counts in budgets.items()}
+    return [_Row(tuple(group), _marks(group, usual, results)) for group in groups]
+
+
+def _marks(
+    group: Sequence[HashedTest], usual: Mapping[tuple[str, Any], tuple[Any, ...]], results: Mapping[str, HashedTest]
+) -> str:
+    first = group[0]
+    seen = len(earlier_choices(results, method_of(first), first.choice))
+    marks = [f"a{seen}"] if seen else []
+    if first.training:
+        marks += ["b"] if budget(first) != usual[first.task, first.heuristic] else []
+        marks += ["s"] if any(one.training.get("tested_before") for one in group) else []
+        marks += ["t"] if first.configuration.get("targets_version", 1) < TARGETS_VERSION else []
+    marks += [] if all(one.values for one in group) else ["v"]
+    return " ".join(marks)
+
+
+def _compared(rows: Sequence[_Row], reference: str) -> dict[int, Difference | str]:
+    """Difference of each row to the reference of its task, or why there is none."""
+    found: dict[int, Difference | str] = {}
+    for _, group in itertools.groupby(enumerate(rows), key=lambda one: one[1].first.task):
+        numbered = dict(group)
+        base = next((row for row in numbered.values() if row.first.label == reference and row.has_values), None)
+        if base is None:
+            continue
+        others = {number: row for number, row in numbered.items() if row is not base and row.has_values}
+        allowed = {number: row for number, row in others.items() if _is_fair(row, base)}
+        found |= dict.fromkeys(others.keys() - allowed.keys(), "other budget")
+        found |= _differences(allowed, base)
+    return found
+
+
+def _differences(rows: Mapping[int, _Row], base: _Row) -> dict[int, Difference]:
+    """To one row, each on all months that both played; corrected as one family."""
+    found: dict[int, Difference] = {}
+    for number, row in rows.items():
+        months = common_months(row.first.months, base.first.months)
+        (found[number],) = paired_differences([one.scores("survival", months) for one in (row, base)], [(0, 1)])
+    corrected = holm([one.p for one in found.values()])
+    return {number: replace(one, holm=float(p)) for (number, one), p in zip(found.items(), corrected, strict=True)}
+
+
+def _is_fair(row: _Row, base: _Row) -> bool:
+    """Whether a difference is of the agents: on the same list, and trained ones with the same budget."""
+    same_list = common_months(row.first.months, base.first.months) > 0
+    return same_list and (not (row.first.training and base.first.training) or budget(row.first) == budget(base.first))
+
+
+def _choice(result: HashedTest) -> tuple[Any, ...]:
+    return _place(result)[:-1]
 
 
 def _place(result: HashedTest) -> tuple[Any, ...]:
     """Where a result stands; those that differ in the last element alone are seeds of one configuration."""
-    configuration = result.configuration
-    others = dict(configuration.get("hyperparameters", {}))
-    seed = others.pop("seed", 0)
-    what = identity_hash({**configuration, "hyperparameters": others})
-    trained = "algorithm" in configuration
-    return configuration["task"], trained, result.agent, str(result.heuristic), what, seed
+    seed = result.configuration.get("hyperparameters", {}).get("seed", 0)
+    return result.task, bool(result.training), result.agent, str(result.heuristic), result.choice, seed
 
 
-def _cells(group: Sequence[HashedTest]) -> list[str]:
-    first, training = group[0], [result.training for result in group]
-    cells = [short_id(first.configuration["task"]), first.agent, first.heuristic or "none"]
+def _cells(row: _Row, compared: Difference | str | None) -> list[str]:
+    first, training = row.first, [result.training for result in row.results]
+    cells = [short_id(first.task), first.agent, first.heuristic or "none", _months(first)]
     if first.training:
-        steps = sum(run["grid_steps"] for run in training) / len(group) / 1e6
+        steps = sum(run["grid_steps"] for run in training) / len(training) / 1e6
         minutes, validation = ([run[name] for run in training] for name in ("minutes", "validation_survival"))
         cells += [f"{training[0]['decisions']:,} ({steps:.1f} M)", _seeds(minutes, ".0f"), _seeds(validation, ".3f")]
     else:
         cells += ["", "", ""]
-    _, low, high = first.test["survival"]
-    survival = _seeds(_tested(group, "survival"), ".3f")
-    cells.append(f"{survival} [{low:.3f}, {high:.3f}]" if len(group) == 1 else f"**{_mean(group):.3f}** of {survival}")
-    cells += [_seeds(_tested(group, name), form) for name, form in _TESTED.items()]
-    return cells
+    cells += _survival(row)
+    if isinstance(compared, Difference):
+        cells += [difference_cell(compared).text, p_cell(compared).text]
+    else:
+        cells += [compared or "", ""]
+    return [*cells, *_shares(row), row.marks]
 
 
-def _tested(group: Sequence[HashedTest], name: str) -> list[float]:
-    return [result.test[name][0] for result in group]
+def _months(result: HashedTest) -> str:
+    version = result.months["split_version"]
+    return str(result.months["number"]) + (f" (list {version})" if version else "")
 
 
-def _mean(group: Sequence[HashedTest]) -> float:
-    return sum(_tested(group, "survival")) / len(group)
+def _survival(row: _Row) -> list[str]:
+    """Of the best policies, and of the last."""
+    each = [result.test["survival"][0] for result in row.results]
+    if not row.has_values:
+        _, low, high = row.first.test["survival"]
+        mean = f"**{np.mean(each):.3f}** of {_seeds(each, '.3f')}"
+        return [f"{each[0]:.3f} [{low:.3f}, {high:.3f}]" if len(each) == 1 else mean, ""]
+    best = with_interval(estimate(row.scores("survival")), 3)
+    last = estimate(row.scores("survival", of_last=True)).value if any(one.last for one in row.results) else None
+    return [best if len(each) == 1 else f"**{best}** of {_seeds(each, '.3f')}", "" if last is None else f"{last:.3f}"]
+
+
+def _shares(row: _Row) -> list[str]:
+    """Completed, cost and safe months."""
+    if not row.has_values:
+        forms = {"completed": ".0%", "cost_tlo": ".0f", "safe_tlo": ".0%", "safe_lsi": ".0%"}
+        return [_seeds([result.test[name][0] for result in row.results], form) for name, form in forms.items()]
+    cost = estimate(row.scores("cost_tlo")).value
+    completed, tlo, lsi = (estimate(one) for one in (row.scores("completed"), row.safe("TLO"), row.safe("LSI")))
+    return [share_text(completed), f"{cost:.0f}", share_text(tlo), share_text(lsi)]
 
 
 def _seeds(values: Sequence[float], form: str) -> str:

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from rl2grid.analysis.table import result_table_rich
+from rl2grid.envs.tasks import find_task
 from rl2grid.errors import UsageError
 from rl2grid.records.entries import PlayableEntry, read_entry, write_entry
 from rl2grid.records.evaluations import check_comparable
@@ -58,6 +59,7 @@ def _add_test(actions: Any) -> None:
     parser = actions.add_parser("test", help="play the test months once, and enter the result in a ledger")
     parser.add_argument("subjects", nargs="*", metavar="subject", help=_SUBJECT)
     parser.add_argument("--ledger", type=Path, required=True, help="the file")
+    _add_months(parser)
     parser.set_defaults(run=_test)
 
 
@@ -65,13 +67,22 @@ def _add_verify(actions: Any) -> None:
     parser = actions.add_parser("verify", help="play the actions of entries, or tests of a ledger, again and compare")
     parser.add_argument("files", nargs="*", metavar="file", help=f"entries; with --ledger: each {_SUBJECT}")
     parser.add_argument("--ledger", type=Path, default=None, help="compare with the test results of this file")
+    _add_months(parser)
     parser.set_defaults(run=_verify)
+
+
+def _add_months(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--months", type=int, default=None, help="the first of the test months; by default all")
 
 
 def _add_table(actions: Any) -> None:
     parser = actions.add_parser("table", help="rank entries by survival, as they are stored")
     parser.add_argument("files", nargs="*", type=Path, metavar="file", help="entries")
     parser.add_argument("--ledger", type=Path, default=None, help="print the test results of this file instead")
+    parser.add_argument("--task", default=None, help="of a ledger: the rows of this task alone")
+    parser.add_argument(
+        "--to", default=None, metavar="NAME", help="of a ledger: what rows are compared with, as 'greedy + recovery'"
+    )
     parser.set_defaults(run=_table)
 
 
@@ -94,28 +105,30 @@ def _entry(options: argparse.Namespace) -> int:
 
 
 def _test(options: argparse.Namespace) -> int:
-    from rl2grid.ledger.subjects import find_subject, play_test
+    from rl2grid.ledger.subjects import count_look, find_subject, play_test
 
-    for subject in [find_subject(text) for text in options.subjects]:
-        if subject.digest in read_ledger(options.ledger):
+    for subject in [find_subject(text, options.months) for text in options.subjects]:
+        results = read_ledger(options.ledger)
+        if subject.digest in results:
             print(f"{subject.agent} on {subject.task.id} has had its test: see {options.ledger.name}.")
             continue
+        print(count_look(subject, results), flush=True)
         add_test(options.ledger, play_test(subject))
     return 0
 
 
 def _verify(options: argparse.Namespace) -> int:
     if options.ledger is not None:
-        return _verify_tests(options.ledger, options.files)
+        return _verify_tests(options.ledger, options.files, options.months)
     return _verify_entries([Path(file) for file in _some(options.files)])
 
 
-def _verify_tests(ledger: Path, texts: Sequence[str]) -> int:
+def _verify_tests(ledger: Path, texts: Sequence[str], months: int | None) -> int:
     from rl2grid.ledger.subjects import find_subject
     from rl2grid.ledger.verification import verify_test
 
     different = 0
-    for subject in [find_subject(text) for text in texts]:
+    for subject in [find_subject(text, months) for text in texts]:
         stored = read_ledger(ledger).get(subject.digest)
         if stored is None:
             raise UsageError(f"The ledger has no test of {str(subject.agent)!r} on {subject.task.id} to compare with.")
@@ -151,7 +164,8 @@ def _table(options: argparse.Namespace) -> int:
     if options.ledger is not None:
         from rl2grid.analysis.ledger_table import ledger_table
 
-        print(ledger_table(read_ledger(options.ledger).values()))
+        task = None if options.task is None else find_task(options.task).id
+        print(ledger_table(read_ledger(options.ledger), task, options.to))
         return 0
     from rl2grid.analysis.result_tables import entry_table
 

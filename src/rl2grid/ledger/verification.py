@@ -92,7 +92,7 @@ def verify_test(stored: HashedTest, subject: Subject) -> str | None:
         The names of what differs; None if policy and episodes are exactly those of the ledger.
     """
     again = play_test(subject)
-    differing = [name for name in ("episodes_hash", "test") if getattr(again, name) != getattr(stored, name)]
+    differing = [name for name in ("episodes_hash", "test", "last") if getattr(again, name) != getattr(stored, name)]
     if subject.training and subject.training["policy_hash"] != stored.training["policy_hash"]:
         differing.append("policy_hash")
     return ", ".join(differing) or None

@@ -1,21 +1,24 @@
 """The ledger of test results: what came out when a frozen configuration played the test months, its one time.
 
-A ledger is one JSON file of results by the hash of their configuration. A result holds hashes in place of episodes: who
-has the agent can play the months again and compare, bit for bit. What anyone can check without the agent is an entry of
-a leaderboard, :mod:`rl2grid.records.entries`.
+A ledger is one JSON file of results by the hash of their configuration, in the order in which they were entered. A
+result holds what every month came to in place of episodes: who has the agent can play the months again and compare,
+bit for bit, and who has two results of the same months can compare the agents. What anyone can check without the agent
+is an entry of a leaderboard, :mod:`rl2grid.records.entries`. What the order says of each result is in
+:mod:`rl2grid.records.looks`.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from rl2grid.errors import UsageError
 from rl2grid.records.evaluations import Evaluation, identity_hash
 from rl2grid.records.files import write_json
+from rl2grid.records.month_values import pack_months
 from rl2grid.records.statistics import Estimate
 
 _FIGURES = ("survival", "completed", "cost_lsi", "cost_tlo", "safe_lsi", "safe_tlo", "decisions")
@@ -29,7 +32,7 @@ class HashedTest:
     """
 
     configuration: Mapping[str, Any]
-    """Task, algorithm, hyperparameters and keywords of the environment, or agent, task and heuristic."""
+    """Task, algorithm, hyperparameters and keywords of the environment, or agent, task and heuristic; which months."""
     training: Mapping[str, Any]
     """How it came to be: command, decisions, minutes, hash of the policy; empty without training."""
     identity_hash: str
@@ -38,6 +41,17 @@ class HashedTest:
     """Of what must be equal wherever the episodes are played."""
     test: Mapping[str, Any]
     """Number of episodes, and value, low and high end of each figure, rounded."""
+    months: Mapping[str, Any]
+    """Which months: split, its version, that of the generator, number of months and of seeds."""
+    values: Mapping[str, str] = field(default_factory=dict)
+    """What every month came to, see :mod:`rl2grid.records.month_values`; empty for results on the first test list."""
+    last: Mapping[str, str] = field(default_factory=dict)
+    """The same of the run's last policy; empty where that is the best one, or nothing was trained."""
+
+    @property
+    def task(self) -> str:
+        """Id of the task."""
+        return str(self.configuration["task"])
 
     @property
     def heuristic(self) -> str | None:
@@ -51,18 +65,55 @@ class HashedTest:
         """The algorithm, or the agent without training."""
         return str(self.configuration.get("algorithm") or self.configuration["agent"])
 
+    @property
+    def label(self) -> str:
+        """Agent and heuristic."""
+        return f"{self.agent} + {self.heuristic}" if self.heuristic else self.agent
 
-def hashed_test(configuration: Mapping[str, Any], training: Mapping[str, Any], evaluation: Evaluation) -> HashedTest:
-    """What the ledger keeps of an evaluation."""
+    @property
+    def choice(self) -> str:
+        """See :func:`choice_hash`."""
+        return choice_hash(self.configuration)
+
+
+def choice_hash(configuration: Mapping[str, Any]) -> str:
+    """Hash of what was chosen: a configuration without its seed, which repeats a training and chooses nothing."""
+    others = {key: value for key, value in configuration.get("hyperparameters", {}).items() if key != "seed"}
+    return identity_hash({**configuration, "hyperparameters": others})
+
+
+def hashed_test(
+    configuration: Mapping[str, Any],
+    training: Mapping[str, Any],
+    evaluation: Evaluation,
+    last: Evaluation | None = None,
+) -> HashedTest:
+    """What the ledger keeps of an evaluation.
+
+    Args:
+        configuration: frozen.
+        training: how the policy came to be; empty without training.
+        evaluation: of the best policy by validation, or of the agent.
+        last: of the last policy on the same months; None: it is the best one.
+    """
     rows = [[row.scenario, row.seed, row.grid_steps, row.decisions, row.episode_return] for row in evaluation.episodes]
-    summary = evaluation.summary
+    summary, identity = evaluation.summary, evaluation.identity
     figures = {name: _interval(getattr(summary, name)) for name in _FIGURES}
     return HashedTest(
         configuration=dict(configuration),
         training=dict(training),
-        identity_hash=identity_hash(evaluation.identity),
+        identity_hash=identity_hash(identity),
         episodes_hash=identity_hash({"rows": rows}),
         test={"episodes": summary.episodes, **figures},
+        months={
+            "split": identity["split"],
+            "split_version": identity.get("split_version"),
+            "generator_version": identity.get("generator_version"),
+            "number": summary.scenarios,
+            "seeds": summary.seeds,
+        },
+        values=pack_months(evaluation.episodes),
+        last={} if last is None else pack_months(last.episodes),
     )
 
 

@@ -7,7 +7,7 @@ Runs and months are crossed: every run plays every month. A value is
 so that the mean over R runs and M months has the variance var(run) / R + var(month) / M + var(run x month) / (R M). The
 two last terms together are what the means of the months vary, divided by M; the first is estimated by the mean squares
 of an analysis of variance, and 0 where that would be negative. The degrees of freedom are Satterthwaite's (1946): few
-runs that vary leave few. ``benchmarks/coverage.py`` shows what intervals with these quantiles cover.
+runs that vary leave few. ``benchmarks/intervals.py`` shows what intervals with these quantiles cover.
 """
 
 from __future__ import annotations

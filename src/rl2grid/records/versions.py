@@ -5,6 +5,10 @@ from __future__ import annotations
 import platform
 from importlib import metadata
 
+TARGETS_VERSION = 2
+"""Version of what algorithms learn from. 1 counted the steps that a reset plays into the first transition, whose
+consequences weighed next to nothing then; 2 counts every transition from its decision."""
+
 LIBRARIES: tuple[str, ...] = ("rl2grid", "grid2op", "lightsim2grid", "numba", "numpy", "gymnasium", "torch")
 """Packages whose version is part of the identity of a result."""
 

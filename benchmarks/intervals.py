@@ -1,8 +1,8 @@
 """How often 95% intervals hold the truth, where the truth is known.
 
-``python benchmarks/coverage.py [--datasets N]`` draws tables of runs by months with known components of variance, as
+``python benchmarks/intervals.py [--datasets N]`` draws tables of runs by months with known components of variance, as
 often as asked, computes the intervals that tables of results show, and counts how many hold what they estimate. It
-writes ``benchmarks/results/coverage.json``: a row for each world, number of runs and number of months.
+writes ``benchmarks/results/intervals.json``: a row for each world, number of runs and number of months.
 
 In a normal world a value is the sum of a run's, a month's and their common part. In a world of survival that sum is cut
 at 0 and 1, so that many months are completed, or lost at once; the share of months above 1 is that of completed ones.
@@ -27,7 +27,7 @@ from scipy import stats
 from rl2grid.records.comparisons import paired_differences, probability_of_improvement
 from rl2grid.records.statistics import UNIT, Estimate, Scores, estimate, iqm_score, mean_score, resampled
 
-RESULTS = Path(__file__).resolve().parent / "results" / "coverage.json"
+RESULTS = Path(__file__).resolve().parent / "results" / "intervals.json"
 FAMILY = 5
 """Methods that are compared with each other at once."""
 IQM_EVERY = 5

@@ -1,0 +1,63 @@
+"""Looks at test months: how often a list was looked at, and who was entered after what was seen.
+
+Everything here follows from the order of a ledger, so that nobody has to remember it. A *look* is the test of one
+choice: a configuration, whose further seeds repeat the training and choose nothing. What is chosen after earlier looks
+may have been chosen because of them; the best of many looks is lucky by some standard errors, however large a list is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from rl2grid.envs.tasks import find_task
+from rl2grid.records.ledger import HashedTest
+
+LOOKS = 100
+"""At the test months of one grid: then the list is used up. Of so many equal agents the luckiest looks 2.5 standard
+errors better than it is."""
+
+
+def looks(results: Mapping[str, HashedTest], grid_id: str, split_version: str | None) -> list[str]:
+    """The choices that were tested on a list of a grid, in the order of their first test.
+
+    Args:
+        results: of a ledger.
+        grid_id: whose test months.
+        split_version: of the list.
+    """
+    tested = [one.choice for one in results.values() if _list_of(one) == (grid_id, split_version)]
+    return list(dict.fromkeys(tested))
+
+
+def earlier_choices(results: Mapping[str, HashedTest], method: tuple[Any, ...], choice: str) -> list[str]:
+    """Other choices of a method that had had their test on the same list before one of it.
+
+    Args:
+        results: of a ledger.
+        method: of the choice, see :func:`method_of`.
+        choice: in the ledger, or still to be entered.
+    """
+    seen: list[str] = []
+    for one in results.values():
+        if one.choice == choice:
+            break
+        if method_of(one) == method and one.choice not in seen:
+            seen.append(one.choice)
+    return seen
+
+
+def method_of(result: HashedTest) -> tuple[Any, ...]:
+    """What the tests of one method on one list have in common: task, agent, heuristic and the version of the list."""
+    return result.task, result.agent, result.heuristic, result.months["split_version"]
+
+
+def budget(result: HashedTest) -> tuple[Any, ...]:
+    """What a training had: decisions, and validations to pick the best policy from; empty without training."""
+    if not result.training:
+        return ()
+    return tuple(result.training.get(name) for name in ("decisions", "validations", "validation_months"))
+
+
+def _list_of(result: HashedTest) -> tuple[str, Any]:
+    return find_task(result.task).grid_id, result.months["split_version"]
