@@ -30,7 +30,8 @@ LEGEND = (
     "shares of months, with Wilson's intervals. Marks: a, entered after other configurations of the same agent and "
     "heuristic had had their test on these months (their number); b, another budget (decisions, validations, months of "
     "each) than most trained rows of the task with that heuristic; s, a run that had been evaluated on test months "
-    "before; t, trained with targets of an earlier version; v, of an earlier list, of whose months nothing is kept."
+    "before; t, trained under a heuristic with targets of an earlier version; v, of an earlier list, of whose months "
+    "nothing is kept."
 )
 _HEADINGS = (
     "task",
@@ -112,7 +113,7 @@ def _rows(shown: Mapping[str, HashedTest], results: Mapping[str, HashedTest]) ->
     for first, *_ in groups:
         if first.training:
             budgets.setdefault((first.task, first.heuristic), Counter())[budget(first)] += 1
-    usual = {key: counts.most_common(1)[0][0] for key, counts in budgets.items()}
+    usual = {key: max(counts, key=lambda one: (counts[one], one[0])) for key, counts in budgets.items()}
     return [_Row(tuple(group), _marks(group, usual, results)) for group in groups]
 
 
@@ -125,7 +126,8 @@ def _marks(
     if first.training:
         marks += ["b"] if budget(first) != usual[first.task, first.heuristic] else []
         marks += ["s"] if any(one.training.get("tested_before") for one in group) else []
-        marks += ["t"] if first.configuration.get("targets_version", 1) < TARGETS_VERSION else []
+        is_old = first.configuration.get("targets_version", 1) < TARGETS_VERSION
+        marks += ["t"] if is_old and first.heuristic else []  # without a heuristic, the targets were the same
     marks += [] if all(one.values for one in group) else ["v"]
     return " ".join(marks)
 

@@ -20,6 +20,7 @@ from rl2grid.evaluation.flags import environment_flags, evaluate_command
 from rl2grid.evaluation.protocol import evaluate, first_months
 from rl2grid.records.evaluations import Evaluation
 from rl2grid.records.methods import group_methods
+from rl2grid.scenarios.splits import TEST
 
 
 def run(options: argparse.Namespace) -> int:
@@ -47,6 +48,8 @@ def run(options: argparse.Namespace) -> int:
             )
     if len(results) > 1:
         _compare(results, console)
+    if options.split == TEST:
+        print("These test months were looked at outside of a ledger, which counts looks: 'rl2grid leaderboard test'.")
     for result in results:
         assert result.folder is not None
         print(f"{len(result.episodes)} episodes in {result.folder / 'episodes.csv'}.")

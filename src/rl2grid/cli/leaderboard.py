@@ -79,7 +79,7 @@ def _add_table(actions: Any) -> None:
     parser = actions.add_parser("table", help="rank entries by survival, as they are stored")
     parser.add_argument("files", nargs="*", type=Path, metavar="file", help="entries")
     parser.add_argument("--ledger", type=Path, default=None, help="print the test results of this file instead")
-    parser.add_argument("--task", default=None, help="of a ledger: the rows of this task alone")
+    parser.add_argument("--task", dest="only", default=None, help="of a ledger: the rows of this task alone")
     parser.add_argument(
         "--to", default=None, metavar="NAME", help="of a ledger: what rows are compared with, as 'greedy + recovery'"
     )
@@ -164,7 +164,7 @@ def _table(options: argparse.Namespace) -> int:
     if options.ledger is not None:
         from rl2grid.analysis.ledger_table import ledger_table
 
-        task = None if options.task is None else find_task(options.task).id
+        task = None if options.only is None else find_task(options.only).id
         print(ledger_table(read_ledger(options.ledger), task, options.to))
         return 0
     from rl2grid.analysis.result_tables import entry_table
