@@ -22,11 +22,14 @@ def untrained(agent: str, survivals: list[float]) -> HashedTest:
     return hashed_test(configuration, {}, result(agent, [[one] for one in survivals], **MONTHS))
 
 
-def trained(seed: int, survivals: list[float], last: list[float] | None = None, **changes: Any) -> HashedTest:
-    configuration = {"algorithm": "ppo", "task": TASK, "hyperparameters": {"seed": seed}, "targets_version": 2}
+def trained(
+    seed: int, survivals: list[float], last: list[float] | None = None, steps: int = 1000, **changes: Any
+) -> HashedTest:
+    hyperparameters = {"seed": seed, "total_timesteps": steps}
+    configuration = {"algorithm": "ppo", "task": TASK, "hyperparameters": hyperparameters, "targets_version": 2}
     configuration |= {"env_keywords": {"heuristic": "idle"}}
-    training = {"grid_steps": 5_000_000, "minutes": 3.0, "validation_survival": 0.75, "decisions": 1000}
-    training |= {name: changes.pop(name) for name in ("decisions", "tested_before") if name in changes}
+    training = {"grid_steps": 5_000_000, "minutes": 3.0, "validation_survival": 0.75, "decisions": steps}
+    training |= {"identity": {}, "tested_before": changes.pop("tested_before", False)}
     played = [
         None if values is None else result("ppo", [[one] for one in values], "idle", **MONTHS)
         for values in (survivals, last)
@@ -75,7 +78,7 @@ def test_seeds_stand_together_and_are_compared_on_the_same_months():
 
 
 def test_what_cannot_be_compared_is_marked():
-    other = trained(1, [0.5, 0.5], network="graph", decisions=5000)
+    other = trained(1, [0.5, 0.5], steps=5000)
     results = ledger(
         untrained("do-nothing", [0.1, 0.2]),
         trained(1, [0.6, 0.8]),

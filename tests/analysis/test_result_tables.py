@@ -107,6 +107,18 @@ def test_a_ranking_compares_with_its_first_row():
     assert "over months alone for the one training run of ppo + recovery, ppo, which says nothing" in table.caption
 
 
+def test_trainings_with_other_budgets_are_no_pair():
+    def one(agent: str, decisions: int, survivals: list[list[float]]):
+        trained = {"seed": 1, "budget": {"decisions": decisions}}
+        return result(agent, survivals, agent_hash=agent, agent_identity={"algorithm": agent, "trained_with": trained})
+
+    methods = group_methods([one("ppo", 1000, [[1.0], [0.9]]), one("sac", 5000, [[0.5], [0.3]])])
+    (row,) = comparison_table(methods).rows
+    assert texts(row)[3:5] == ["other budget", MISSING.text]
+    assert texts(ranking_table(methods[TASK]).rows[1])[2:4] == ["other budget", MISSING.text]
+    assert texts(reference_table(methods[TASK]).rows[0])[1:3] == ["other budget", MISSING.text]
+
+
 def test_methods_are_compared_with_one_of_them():
     table = reference_table(METHODS[TASK], reference=2)
     assert [row[0].text for row in table.rows] == ["ppo + recovery", "ppo"]

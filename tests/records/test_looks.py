@@ -12,9 +12,13 @@ TASK = "rl2grid/bus14-T0-v0"
 
 
 def entry(seed: int, learning_rate: float = 0.1, version: str = "2", **configuration: Any) -> HashedTest:
-    chosen = {"algorithm": "ppo", "task": TASK, "hyperparameters": {"seed": seed, "learning_rate": learning_rate}}
+    chosen = {
+        "algorithm": "ppo",
+        "task": TASK,
+        "hyperparameters": {"total_timesteps": 1000, "seed": seed, "learning_rate": learning_rate},
+    }
     chosen |= {"env_keywords": {"heuristic": "idle"}, "test": {"split_version": version, "months": 500}}
-    training = {"decisions": 1000, "validations": 4, "validation_months": 20}
+    training = {"identity": {"budget": {"decisions": 1000, "evaluate_every": 250, "validation_months": 20}}}
     months = {"split": "test", "split_version": version, "generator_version": "1", "number": 500, "seeds": 1}
     return HashedTest({**chosen, **configuration}, training, "", "", {}, months)
 
@@ -43,5 +47,5 @@ def test_what_came_after_another_choice_of_its_method_is_known():
 
 
 def test_a_budget_is_decisions_and_validations():
-    assert budget(entry(1)) == (1000, 4, 20)
+    assert budget(entry(1)) == (("decisions", 1000), ("evaluate_every", 250), ("validation_months", 20))
     assert budget(HashedTest({"agent": "greedy", "task": TASK, "heuristic": None}, {}, "", "", {}, {})) == ()

@@ -10,7 +10,7 @@ from sample_results import TASK, result
 
 from rl2grid.errors import UsageError
 from rl2grid.records.evaluations import Evaluation
-from rl2grid.records.methods import group_methods, interval_units, interval_words
+from rl2grid.records.methods import group_methods, interval_units, interval_words, is_fair
 from rl2grid.records.trainings import group_curves, read_training_run
 
 OTHER_TASK = "rl2grid/bus36-MO-v0-T0-v0"
@@ -57,6 +57,22 @@ def trained(seeds: tuple[int, int] = (1, 2), algorithms: tuple[str, str] = ("ppo
         result("a", [[0.5]], agent_hash=f"{k}", agent_identity={"algorithm": name, "trained_with": {"seed": seed}})
         for k, (seed, name) in enumerate(zip(seeds, algorithms, strict=True))
     ]
+
+
+def test_trained_methods_with_other_budgets_are_no_fair_pair():
+    def one(agent: str, seed: int, decisions: int) -> Evaluation:
+        trained = {"seed": seed, "budget": {"decisions": decisions}}
+        identity = {"algorithm": agent, "trained_with": trained}
+        return result(agent, [[0.5]], agent_hash=f"{agent}{seed}", agent_identity=identity)
+
+    plain, short, alike, long = group_methods(
+        [result("plain", [[0.4]]), one("ppo", 1, 1000), one("sac", 1, 1000), one("dqn", 1, 5000)]
+    )[TASK]
+    assert is_fair(short, alike)
+    assert is_fair(plain, long)
+    assert not is_fair(short, long)
+    with pytest.raises(UsageError, match=r"trained with decisions=1000 and 5000: tell them apart"):
+        group_methods([one("ppo", 1, 1000), one("ppo", 2, 5000)])
 
 
 def test_trainings_with_other_seeds_are_one_method():

@@ -113,7 +113,7 @@ def _rows(shown: Mapping[str, HashedTest], results: Mapping[str, HashedTest]) ->
     for first, *_ in groups:
         if first.training:
             budgets.setdefault((first.task, first.heuristic), Counter())[budget(first)] += 1
-    usual = {key: max(counts, key=lambda one: (counts[one], one[0])) for key, counts in budgets.items()}
+    usual = {key: max(counts, key=lambda one: (counts[one], dict(one)["decisions"])) for key, counts in budgets.items()}
     return [_Row(tuple(group), _marks(group, usual, results)) for group in groups]
 
 

@@ -5,16 +5,14 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
 
-from rl2grid.analysis.comparison_table import comparison_table, pairwise
+from rl2grid.analysis.comparison_table import comparison_table, pair_cells, pairwise
 from rl2grid.analysis.table import (
     MISSING,
     Cell,
     Column,
     ResultTable,
-    difference_cell,
     interval_cell,
     mean_cell,
-    p_cell,
     share_cell,
 )
 from rl2grid.envs.tasks import short_id
@@ -102,11 +100,11 @@ def _ranking_table(
     best = _printed_best([survival.value for survival in survivals], 3)
     rows = []
     for place, (name, method, survival) in enumerate(zip(names, ranked, survivals, strict=True)):
-        to_first = differences.get((place, 0))
+        to_first = pair_cells(differences.get((place, 0))) if place else (MISSING, MISSING)
         estimates = (method.scores("completed"), *(method.safe(name) for name in limits))
         cells = (
             interval_cell(survival, best=round(survival.value, 3) == best),
-            *((difference_cell(to_first), p_cell(to_first)) if to_first else (MISSING, MISSING)),
+            *to_first,
             *(share_cell(estimate(scores)) for scores in estimates),
         )
         counts = [str(number) for number in (*method.scores("survival").values.shape, len(method.episodes))]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 from rl2grid.algorithms.registry import algorithm_names
 from rl2grid.cli.keywords import flag_text, reward_of
 from rl2grid.envs.options import TaskOptions, options_of, options_without
-from rl2grid.envs.tasks import Task, find_task
+from rl2grid.envs.tasks import Task, find_task, short_id
 from rl2grid.errors import UsageError
 from rl2grid.scenarios.splits import VALIDATION_MONTHS
 from rl2grid.training.limits import TimeLimit
@@ -154,7 +154,7 @@ def _report(folder: Path, task: Task, limit: TimeLimit) -> int:
     if not finished:
         print(f"Run stopped: {folder}. Go on with `rl2grid train --resume {folder}`.")
         return INTERRUPTED
-    print(f"Run complete: {folder}. Evaluate it with `rl2grid evaluate {folder} {task.id} --split test`.")
+    print(f"Run complete: {folder}. Evaluate it with `rl2grid evaluate {folder} {short_id(task.id)}`.")
     return 0
 
 

@@ -52,11 +52,12 @@ def method_of(result: HashedTest) -> tuple[Any, ...]:
     return result.task, result.agent, result.heuristic, result.months["split_version"]
 
 
-def budget(result: HashedTest) -> tuple[Any, ...]:
+def budget(result: HashedTest) -> tuple[tuple[str, Any], ...]:
     """What a training had: decisions, and validations to pick the best policy from; empty without training."""
     if not result.training:
         return ()
-    return tuple(result.training.get(name) for name in ("decisions", "validations", "validation_months"))
+    decisions = result.configuration["hyperparameters"]["total_timesteps"]
+    return tuple(sorted({"decisions": decisions, **result.training["identity"].get("budget", {})}.items()))
 
 
 def _list_of(result: HashedTest) -> tuple[str, Any]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -56,6 +57,11 @@ class Method:
         return bool(self.first.agent_hash)
 
     @property
+    def budget(self) -> Mapping[str, Any]:
+        """Decisions and validations of each of its trainings; empty where nothing was trained, or nothing says."""
+        return _trained_with(self.evaluations[0]).get("budget") or {}
+
+    @property
     def episodes(self) -> tuple[Episode, ...]:
         """Of all runs."""
         return tuple(episode for result in self.evaluations for episode in result.episodes)
@@ -76,6 +82,11 @@ class Method:
     def safe(self, constraint: str) -> Scores:
         """1 for episodes that were completed as well: dying early is not safety."""
         return safe_scores([result.episodes for result in self.evaluations], constraint)
+
+
+def is_fair(x: Method, y: Method) -> bool:
+    """Whether a difference is one of methods: trained ones had the same budget."""
+    return not (x.is_trained and y.is_trained) or x.budget == y.budget
 
 
 def method_label(episode: Episode) -> str:
@@ -149,6 +160,12 @@ def _check_other_training(result: Evaluation, group: Sequence[Evaluation]) -> No
                 f"Evaluations called {who} on {task} are of policies by {theirs[0]} and by {mine[0]}: tell them "
                 "apart as LABEL=FOLDER."
             )
+        for name in sorted({*mine[2], *theirs[2]}):
+            if mine[2].get(name) != theirs[2].get(name):
+                raise UsageError(
+                    f"Evaluations called {who} on {task} are of policies trained with {name}={theirs[2].get(name)} and "
+                    f"{mine[2].get(name)}: tell them apart as LABEL=FOLDER."
+                )
         if mine[1] == theirs[1]:
             raise UsageError(
                 f"Two evaluations of {who} on {task} are of different policies trained with seed {mine[1]}: leave one "
@@ -156,11 +173,18 @@ def _check_other_training(result: Evaluation, group: Sequence[Evaluation]) -> No
             )
 
 
-def _training(result: Evaluation) -> tuple[str | None, int] | None:
-    """Algorithm and seed with which the agent was trained; None where its identity does not say."""
+def _training(result: Evaluation) -> tuple[str | None, int, Mapping[str, Any]] | None:
+    """Algorithm, seed and budget with which the agent was trained; None where its identity does not say."""
+    trained = _trained_with(result)
+    if "seed" not in trained:
+        return None
+    return result.identity["agent_identity"].get("algorithm"), int(trained["seed"]), trained.get("budget") or {}
+
+
+def _trained_with(result: Evaluation) -> Mapping[str, Any]:
     identity = result.identity.get("agent_identity") or {}
-    seed = identity.get("trained_with", {}).get("seed")
-    return None if seed is None else (identity.get("algorithm"), int(seed))
+    trained: Mapping[str, Any] = identity.get("trained_with", {})
+    return trained
 
 
 def _check_same_question(results: Sequence[Evaluation]) -> None:
