@@ -1,8 +1,9 @@
-"""Whether the levels mean something: greedy search on validation months with some of the actions.
+"""Whether the levels mean something: greedy search on validation months with some of the actions, by heuristic.
 
-``python benchmarks/levels.py [GRID ...] [--months N]`` plays the first N validation months with greedy search that may
-play the actions of level 0, of the next level, or as many random ones as level 0 has (three draws), and writes
-``benchmarks/results/levels.json``.
+``python benchmarks/levels.py [GRID ...] [--months N] [--before FOLDER]`` plays the first N validation months with
+greedy search that may play the actions of level 0, of level 1, or as many random ones as level 0 has, without a
+heuristic and with each that closes lines, and writes ``benchmarks/results/levels.json``. ``--before`` names a folder
+with other rankings (``<grid>.ranking.npz``), whose levels are played as well; differences are paired by month.
 """
 
 from __future__ import annotations
@@ -13,55 +14,83 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rl2grid.agents.do_nothing import DoNothing
 from rl2grid.agents.greedy import Greedy
-from rl2grid.evaluation.protocol import evaluate
+from rl2grid.envs.tasks import find_task
+from rl2grid.evaluation.protocol import evaluate, first_months
 from rl2grid.grids import load_grid
 from rl2grid.grids.rankings import ranking_hash
 from rl2grid.mdp.actions import level_ids
-from rl2grid.scenarios.library import list_scenarios
+from rl2grid.records.comparisons import paired_differences
+from rl2grid.records.statistics import Scores
+from rl2grid.scenarios.splits import VALIDATION
 
 RESULTS = Path(__file__).resolve().parent / "results" / "levels.json"
-DRAWS = 3
+HEURISTICS = (None, "recovery", "careful")
 
 
-def measure(grid_id: str, months: int) -> dict[str, Any]:
-    """Mean survival and completed months for each set of actions."""
+def sets_of(grid_id: str, before: Path | None) -> dict[str, NDArray[np.int32] | None]:
+    """Catalogue ids of what may be played, by name; None: nothing is done."""
     grid = load_grid(grid_id)
-    highest = len(grid.level_sizes) - 1
-    sets = {"level 0": level_ids(grid, 0)}
-    if highest > 1:
-        sets["level 1"] = level_ids(grid, 1)
-    random = np.random.default_rng(0)
-    for draw in range(DRAWS):
-        drawn = random.choice(np.arange(1, grid.level_sizes[-1]), grid.level_sizes[0] - 1, replace=False)
-        sets[f"random {draw}"] = drawn
-    result: dict[str, Any] = {"months": months, "ranking": ranking_hash(grid_id)}
-    task, scenarios = f"{grid_id}-T{highest}", list_scenarios(grid_id, "validation")[:months]
-    agents = {"do nothing": DoNothing(), **{name: Greedy(ids.tolist()) for name, ids in sets.items()}}
-    if highest == 1:
-        agents["all"] = Greedy()
-    for name, agent in agents.items():
-        summary = evaluate(agent, task, scenarios=scenarios, heuristic=None, workers=0).summary
-        result[name] = {
-            "actions": len(sets.get(name, ())),
-            "survival": round(summary.survival.value, 4),
-            "interval": [round(summary.survival.low, 4), round(summary.survival.high, 4)],
-            "completed": round(summary.completed.value, 3),
-        }
-        print(grid_id, name, result[name], flush=True)
+    levels = range(min(2, len(grid.level_sizes)))
+    sets: dict[str, NDArray[np.int32] | None] = {"do nothing": None}
+    drawn = np.random.default_rng(0).choice(np.arange(1, grid.level_sizes[-1]), grid.level_sizes[0] - 1, replace=False)
+    sets["random"] = drawn.astype(np.int32)
+    sets |= {f"level {level}": level_ids(grid, level) for level in levels}
+    if before is not None:
+        with np.load(before / f"{grid_id}.ranking.npz") as arrays:
+            ranked = arrays["ids"].astype(np.int32)
+        sets |= {f"level {level} before": ranked[: grid.level_sizes[level] - 1] for level in levels}
+    return sets
+
+
+def measure(grid_id: str, months: int, before: Path | None) -> dict[str, Any]:
+    """Survival for each set of actions and each heuristic, and how the levels differ from those before."""
+    task = find_task(f"{grid_id}-T{len(load_grid(grid_id).level_sizes) - 1}")
+    scenarios = first_months(task, VALIDATION, months)
+    result: dict[str, Any] = {"months": len(scenarios), "ranking": ranking_hash(grid_id), "rows": []}
+    for heuristic in HEURISTICS:
+        scores = {}
+        for name, ids in sets_of(grid_id, before).items():
+            agent = DoNothing() if ids is None else Greedy(ids.tolist())
+            evaluation = evaluate(agent, task, scenarios=scenarios, heuristic=heuristic, workers=0)
+            survival = np.array([episode.survival for episode in evaluation.episodes])
+            scores[name] = Scores(survival[None, :, None])
+            summary = evaluation.summary
+            row = {
+                "heuristic": heuristic or "none",
+                "actions": name,
+                "survival": [
+                    round(x, 4) for x in (summary.survival.value, summary.survival.low, summary.survival.high)
+                ],
+                "completed": round(summary.completed.value, 3),
+            }
+            if f"{name.removesuffix(' before')}" != name:
+                row["gain"] = _gain(scores[name.removesuffix(" before")], scores[name])
+            result["rows"].append(row)
+            print(grid_id, json.dumps(row), flush=True)
     return result
 
 
+def _gain(now: Scores, before: Scores) -> list[float]:
+    """Mean difference by month, its interval, and p."""
+    (difference,) = paired_differences([now, before], [(0, 1)])
+    estimate = difference.estimate
+    return [round(float(x), 4) for x in (estimate.value, estimate.low, estimate.high, difference.p)]
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("grids", nargs="*", default=["bus14", "bus36-MO-v0", "bus118-M"])
-    parser.add_argument("--months", type=int, default=20)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("grids", nargs="*", default=["bus14", "bus36-MO-v0", "bus118-MOB-v0"])
+    parser.add_argument("--months", type=int, default=100)
+    parser.add_argument("--before", type=Path, default=None, help="folder of other rankings")
     arguments = parser.parse_args()
     for grid_id in arguments.grids:
+        measured = measure(grid_id, arguments.months, arguments.before)
         results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
-        results[grid_id] = measure(grid_id, arguments.months)
+        results[grid_id] = measured
         RESULTS.write_text(json.dumps(results, indent=1) + "\n")
 
 
