@@ -10,7 +10,7 @@ from sample_folders import CELLS, cell, write_made_up_evaluation, write_made_up_
 from sample_results import TASK
 
 from rl2grid.errors import UsageError
-from rl2grid.records.collection import collect
+from rl2grid.records.collection import collect, was_evaluated
 from rl2grid.records.episodes import EPISODES_FILE
 
 
@@ -23,6 +23,17 @@ def test_runs_bring_their_evaluations_on_the_split(tmp_path):
     assert [(run.curve.label, run.seed) for run in collection.runs] == [("ppo + idle", 1)]
     assert collection.missing == []
     assert len(collect([str(tmp_path / "run")], "test").evaluations) == 1
+
+
+def test_a_run_was_evaluated_in_its_folder_or_in_its_cell(tmp_path):
+    write_made_up_run(tmp_path / "run")
+    assert not was_evaluated(tmp_path / "run", "test")
+    write_made_up_evaluation(tmp_path / "run" / "evaluation" / "test-20-months")
+    assert was_evaluated(tmp_path / "run", "test")
+    write_made_up_study(tmp_path / "study", [cell("bus14-T0-v0-ppo-idle-1")])
+    of_cell = tmp_path / "study" / "cells" / "bus14-T0-v0-ppo-idle-1" / "run"
+    assert was_evaluated(of_cell, "test")
+    assert not was_evaluated(of_cell, "validation")
 
 
 def test_what_a_run_lacks_is_told(tmp_path):

@@ -16,12 +16,15 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from rl2grid.analysis import figures, summary_table
-from rl2grid.analysis.page import cell_html, code_html, commands_html, scrolling, table_html
+from rl2grid.analysis.comparison_table import reference_table
+from rl2grid.analysis.page import cell_html, code_html, commands_html, result_table_html, scrolling, table_html
 from rl2grid.analysis.page_builder import PageBuilder
 from rl2grid.analysis.section import Picture
+from rl2grid.analysis.table import table_markdown
 from rl2grid.drawing.theme import Theme
 from rl2grid.records.evaluations import Evaluation, check_comparable
 from rl2grid.records.files import write_text
+from rl2grid.records.methods import group_methods
 from rl2grid.records.recordings import Recording
 from rl2grid.records.summary import Summary
 from rl2grid.records.trainings import TrainingCurve
@@ -60,13 +63,16 @@ def write_demo_report(
     page = PageBuilder(title)
     page.add_header(_facts(summaries), introduction=introduction)
     legend = f"<p class=note>{html.escape(summary_table.LEGEND)}</p>"
-    page.add_section("Results", f"{_table_html(summaries)}{legend}")
+    (methods,) = group_methods(results).values()
+    differences = [reference_table(methods)] if len(methods) > 1 else []
+    page.add_section("Results", f"{_table_html(summaries)}{legend}{''.join(map(result_table_html, differences))}")
     pictures = _pictures(results, curves, recordings)
     page.add_figures(pictures, lambda picture: _made_by(picture, commands), folder=folder / FIGURES_FOLDER)
     page.add_section("How episodes ended", _endings_html(summaries))
     page.add_section("What made every number", _commands_html(results, commands))
     page.add_identities([(result.summary.agent, result.identity) for result in results])
-    write_text(folder / TABLE_FILE, f"# {title}\n\n{summary_table.markdown_table(summaries)}\n{summary_table.LEGEND}\n")
+    tables = [f"{summary_table.markdown_table(summaries)}\n{summary_table.LEGEND}\n", *map(table_markdown, differences)]
+    write_text(folder / TABLE_FILE, "\n".join([f"# {title}\n", *tables]))
     page.write(folder / REPORT_FILE)
     return folder / REPORT_FILE
 

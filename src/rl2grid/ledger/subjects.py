@@ -10,7 +10,7 @@ from typing import Any
 from rl2grid.envs.tasks import Task, find_task, short_id
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.protocol import AS_TRAINED, evaluate, first_months
-from rl2grid.records.collection import find_evaluations
+from rl2grid.records.collection import was_evaluated
 from rl2grid.records.evaluations import Evaluation, identity_hash
 from rl2grid.records.ledger import HashedTest, choice_hash, hashed_test
 from rl2grid.records.looks import LOOKS, earlier_choices, looks
@@ -86,7 +86,7 @@ def count_look(subject: Subject, results: Mapping[str, HashedTest]) -> str:
     """
     version = subject.configuration["test"]["split_version"]
     done = looks(results, subject.task.grid_id, version)
-    months = f"the test months of {subject.task.grid_id}, version {version}"
+    months = f"the test months of {subject.task.grid_id}{f', version {version}' if version else ''}"
     if subject.choice in done:
         return f"A further seed of look {done.index(subject.choice) + 1} of {LOOKS} at {months}."
     if len(done) >= LOOKS:
@@ -164,7 +164,7 @@ def _trained(folder: Path, months: int | None) -> Subject:
         "best_after": policy.identity["decisions"],
         "validation_survival": reached[policy.identity["decisions"]]["survival"],
         "policy_hash": policy.identity["policy_hash"],
-        "tested_before": bool(find_evaluations(folder, TEST)),
+        "tested_before": was_evaluated(folder, TEST),
         "identity": dict(identity),
     }
     last = None if training["best_after"] == training["decisions"] else folder / CHECKPOINT_FILE

@@ -90,6 +90,13 @@ def find_evaluations(folder: Path, split: str) -> list[Path]:
     return sorted(path for path in below if is_evaluation(path))
 
 
+def was_evaluated(run: Path, split: str) -> bool:
+    """Whether a run, or the cell of a study that it is of, was evaluated on a split."""
+    cell = read_cell(run.parent)
+    of_cell = cell is not None and cell["split"] == split and is_evaluation(run.parent / EVALUATION_FOLDER)
+    return of_cell or bool(find_evaluations(run, split))
+
+
 def _add_folder(collection: Collection, folder: Path, label: str | None, split: str) -> None:
     evaluations = find_evaluations(folder, split)
     collection.evaluations += [_named(load_evaluation(evaluation), label) for evaluation in evaluations]
