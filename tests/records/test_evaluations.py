@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,7 @@ from sample_results import episode, result
 from rl2grid.analysis.summary_table import HEADINGS, markdown_table, rich_table
 from rl2grid.errors import UsageError
 from rl2grid.records.episodes import COLUMN_NAMES, read_episodes, write_episodes
-from rl2grid.records.evaluations import check_comparable, load_evaluation
+from rl2grid.records.evaluations import check_comparable, load_evaluation, write_evaluation
 from rl2grid.records.metrics import read_validations
 from rl2grid.records.shares import wilson_interval
 from rl2grid.records.summary import by_scenario, summarise
@@ -76,6 +77,13 @@ def test_dying_early_is_not_safe():
     summary = summarise(harmless + harmful)
     assert summary.safe_tlo.value == 0.5  # seeds 1 and 3
     assert summary.safe_lsi.value == 0.5  # seeds 1 and 2
+
+
+def test_a_month_alone_is_stored_without_the_ends_of_intervals(tmp_path):
+    write_evaluation(tmp_path / "evaluation.json", {}, result("someone", [[0.5, 0.7]]).summary)
+    stored = json.loads((tmp_path / "evaluation.json").read_text(), parse_constant=pytest.fail)["summary"]
+    assert stored["episode_return"] == {"value": 54.0, "low": None, "high": None}
+    assert stored["survival"]["low"] < 0.6 < stored["survival"]["high"]
 
 
 def test_the_interval_is_over_months():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
+import math
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -14,6 +15,7 @@ from typing import Any
 from rl2grid.errors import UsageError
 from rl2grid.records.episodes import EPISODES_FILE, Episode, read_episodes
 from rl2grid.records.files import write_json
+from rl2grid.records.statistics import Estimate
 from rl2grid.records.summary import Summary, summarise
 
 EVALUATION_FILE = "evaluation.json"
@@ -66,8 +68,15 @@ def labels(identity: Mapping[str, Any]) -> dict[str, Any]:
 
 def write_evaluation(path: Path, request: Mapping[str, Any], summary: Summary | None) -> None:
     """Write the description of an evaluation, with its aggregates once it is complete."""
-    record = {**request, "complete": summary is not None, "summary": asdict(summary) if summary else None}
-    write_json(path, record)
+    figures = None if summary is None else {name: _plain(value) for name, value in vars(summary).items()}
+    write_json(path, {**request, "complete": summary is not None, "summary": figures})
+
+
+def _plain(value: Any) -> Any:
+    """A figure as JSON has it, which knows no NaN: an interval that there is not has no ends."""
+    if not isinstance(value, Estimate):
+        return value
+    return {name: None if math.isnan(number) else number for name, number in asdict(value).items()}
 
 
 def read_request(path: Path) -> dict[str, Any]:

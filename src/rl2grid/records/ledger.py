@@ -10,6 +10,7 @@ is an entry of a leaderboard, :mod:`rl2grid.records.entries`. What the order say
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -143,5 +144,7 @@ def add_test(path: Path, result: HashedTest) -> None:
     write_json(path, {digest: asdict(one) for digest, one in results.items()}, indent=1)
 
 
-def _interval(estimate: Estimate) -> list[float]:
-    return [round(float(value), 4) for value in (estimate.value, estimate.low, estimate.high)]
+def _interval(estimate: Estimate) -> list[float | None]:
+    """Value, low and high; JSON knows no NaN."""
+    values = (estimate.value, estimate.low, estimate.high)
+    return [None if math.isnan(value) else round(value, 4) for value in values]

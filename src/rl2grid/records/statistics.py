@@ -41,9 +41,6 @@ class Estimate:
     """NaN, like :attr:`high`, where results of one month alone tell nothing of others."""
     high: float
 
-    def __str__(self) -> str:
-        return f"{self.value:.3f} [{self.low:.3f}, {self.high:.3f}]"
-
 
 @dataclass(frozen=True, eq=False)
 class Scores:
