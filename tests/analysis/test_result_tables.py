@@ -103,7 +103,7 @@ def test_a_ranking_compares_with_its_first_row():
     table = ranking_table(METHODS[TASK])
     assert texts(table.rows[0])[:5] == ["ppo + recovery", "0.950 [0.764, 0.991]", "-", "-", "50% [9, 91]"]
     assert texts(table.rows[1])[:5] == ["ppo", "0.400 [0.234, 0.593]", "-0.550 [-1.000, -0.086]", "0.115", "0% [0, 66]"]
-    assert [row[-4].text for row in table.rows] == ["1", "1", MISSING.text]
+    assert [row[-1].text for row in table.rows] == ["1 x 2 x 1", "1 x 2 x 1", "- x 2 x 1"]
     assert "over months alone for the one training run of ppo + recovery, ppo, which says nothing" in table.caption
 
 

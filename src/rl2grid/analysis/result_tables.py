@@ -94,7 +94,7 @@ def _ranking_table(
     limit = ranked[0].task.constraint
     limits = (limit,) if limit else tuple(THRESHOLDS)
     shares = ("Completed", *(f"Safe {name}" for name in limits))
-    headings = ("Survival", "To the first", "p", *shares, "Runs", "Months", "Seeds", "Episodes")
+    headings = ("Survival", "To the first", "p", *shares, "Played")
     differences = pairwise(ranked)
     survivals = [estimate(method.scores("survival")) for method in ranked]
     best = _printed_best([survival.value for survival in survivals], 3)
@@ -107,16 +107,15 @@ def _ranking_table(
             *to_first,
             *(share_cell(estimate(scores)) for scores in estimates),
         )
-        counts = [str(number) for number in (*method.scores("survival").values.shape, len(method.episodes))]
-        if not method.is_trained:
-            counts[0] = MISSING.text
-        rows.append((*name, *cells, *(Cell(text) for text in counts)))
+        runs, *others = map(str, method.scores("survival").values.shape)
+        played = " x ".join((runs if method.is_trained else MISSING.text, *others))
+        rows.append((*name, *cells, Cell(played)))
     kept = " or ".join(f"{name} at most {THRESHOLDS[name]:g}" for name in limits)
     order = "share of safe episodes, then survival" if limit else "survival"
     caption = (
         f"By {order}. Survival: mean share of the episode. To the first: difference in survival to the first row "
         "on the same months; p: that there is none, Holm's correction over all pairs of methods. Others: shares of "
-        f"episodes. Safe: completed, and cost {kept}. Runs: trainings of the method. {interval_words(ranked)}."
+        f"episodes. Safe: completed, and cost {kept}. Played: training runs x months x seeds. {interval_words(ranked)}."
     )
     columns = (*name_columns, *(Column(heading) for heading in headings))
     return ResultTable(f"ranking-{_task_name(ranked[0])}", caption, columns, tuple(rows))

@@ -97,7 +97,7 @@ def p_cell(difference: Difference) -> Cell:
 
 
 def result_table_rich(table: ResultTable, title: str | None = None) -> Table:
-    """A table for the terminal, with its caption."""
+    """A table for the terminal, with its caption; intervals stand below their values."""
     shown = Table(
         title=title or table.name,
         title_justify="left",
@@ -110,9 +110,11 @@ def result_table_rich(table: ResultTable, title: str | None = None) -> Table:
     )
     for column in table.columns:
         heading = f"{column.group} {column.heading}".strip()
-        shown.add_column(heading, justify="left" if column.words else "right", no_wrap=not column.words)
+        shown.add_column(
+            heading, justify="left" if column.words else "right", no_wrap=not column.words, min_width=14 * column.words
+        )
     for row in table.rows:
-        shown.add_row(*(Text(cell.text, style="bold" if cell.best else "") for cell in row))
+        shown.add_row(*(Text(cell.text.replace(" [", "\n["), style="bold" if cell.best else "") for cell in row))
     return shown
 
 
