@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -61,7 +62,7 @@ def test_entries_are_ranked_by_survival(folder, capsys, monkeypatch):
     assert main(["leaderboard", "table", *files]) == 0
     output = capsys.readouterr().out
     assert "bus14-T0-v0" in output
-    survivals = [float(line.partition("[")[0].split()[-1]) for line in output.splitlines() if ".json" in line]
+    survivals = [float(re.findall(r" (\d\.\d{3}) ", line)[0]) for line in output.splitlines() if ".json" in line]
     assert len(survivals) == 3
     assert survivals == sorted(survivals, reverse=True)
     assert survivals[0] == 0.999
