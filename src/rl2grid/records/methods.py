@@ -85,8 +85,8 @@ class Method:
 
 
 def is_fair(x: Method, y: Method) -> bool:
-    """Whether a difference is one of methods: trained ones had the same budget."""
-    return not (x.is_trained and y.is_trained) or x.budget == y.budget
+    """Whether a difference is one of methods: nothing says that their trainings had different budgets."""
+    return not (x.budget and y.budget) or x.budget == y.budget
 
 
 def method_label(episode: Episode) -> str:
@@ -160,11 +160,11 @@ def _check_other_training(result: Evaluation, group: Sequence[Evaluation]) -> No
                 f"Evaluations called {who} on {task} are of policies by {theirs[0]} and by {mine[0]}: tell them "
                 "apart as LABEL=FOLDER."
             )
-        for name in sorted({*mine[2], *theirs[2]}):
-            if mine[2].get(name) != theirs[2].get(name):
+        for name in sorted({*mine[2]} & {*theirs[2]}):
+            if mine[2][name] != theirs[2][name]:
                 raise UsageError(
-                    f"Evaluations called {who} on {task} are of policies trained with {name}={theirs[2].get(name)} and "
-                    f"{mine[2].get(name)}: tell them apart as LABEL=FOLDER."
+                    f"Evaluations called {who} on {task} are of policies trained with {name}={theirs[2][name]} and "
+                    f"{mine[2][name]}: tell them apart as LABEL=FOLDER."
                 )
         if mine[1] == theirs[1]:
             raise UsageError(
