@@ -27,7 +27,7 @@ def test_runs_of_one_agent_are_one_method():
     assert (scores.runs, scores.months, scores.bounds) == (2, 2, (0.0, 1.0))
     assert methods[0].scenarios == ("scenario 0", "scenario 1")
     assert methods[0].is_trained
-    assert interval_units(methods) == "training runs and months, of one run over months alone"
+    assert interval_units(methods) == "runs and months (one run: months)"
     assert interval_words(methods) == (
         "95% intervals over training runs and months, crossed; over months alone for the one training run of ppo, "
         "which says nothing of other trainings"

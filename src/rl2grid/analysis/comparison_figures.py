@@ -169,7 +169,7 @@ def draw_lifetimes(methods: Sequence[Method], *, theme: Theme = LIGHT) -> Figure
         _percent(axes.yaxis)
         axes.grid()
         _legend(figure)
-        sentence = f"Kaplan-Meier, 95% bands over {interval_units(methods)}; tick: completed episodes, censored"
+        sentence = f"Kaplan-Meier, 95% bands over {interval_units(methods)}; tick: completed episodes"
         figures._headline(axes, _title("Time to failure", methods), sentence)
     return figure
 

@@ -115,8 +115,8 @@ def interval_units(methods: Iterable[Method]) -> str:
     """What intervals of these methods are over, in few words."""
     repeated = {len(method.evaluations) > 1 for method in methods}
     if repeated == {True}:
-        return "training runs and months"
-    return "training runs and months, of one run over months alone" if True in repeated else "months alone"
+        return "runs and months"
+    return "runs and months (one run: months)" if True in repeated else "months alone"
 
 
 def interval_words(methods: Iterable[Method]) -> str:
