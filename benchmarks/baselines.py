@@ -24,9 +24,8 @@ def main(words: list[str] | None = None) -> int:
     """Run the command with this ledger; returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("command", choices=("test", "verify", "table"))
-    parser.add_argument("subjects", nargs="*")
-    arguments = parser.parse_args(words)
-    return rl2grid(["leaderboard", arguments.command, "--ledger", str(LEDGER), *arguments.subjects])
+    arguments, others = parser.parse_known_args(words)
+    return rl2grid(["leaderboard", arguments.command, "--ledger", str(LEDGER), *others])
 
 
 if __name__ == "__main__":

@@ -50,9 +50,7 @@ def cells(table: str, start: str) -> dict[str, str]:
 
 def test_the_table_of_the_documentation_is_the_ledger():
     table = ledger_table(read_ledger(ROOT / "benchmarks" / "results" / "baselines.json"))
-    assert table.splitlines()[:-2] == [
-        line for line in (ROOT / "docs" / "results.md").read_text().splitlines() if line.startswith("|")
-    ]
+    assert table in (ROOT / "docs" / "results.md").read_text()
 
 
 def test_seeds_stand_together_and_are_compared_on_the_same_months():

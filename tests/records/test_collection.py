@@ -36,6 +36,18 @@ def test_a_run_was_evaluated_in_its_folder_or_in_its_cell(tmp_path):
     assert not was_evaluated(of_cell, "validation")
 
 
+def test_the_last_policy_stands_beside_the_best(tmp_path):
+    write_made_up_run(tmp_path / "run")
+    write_made_up_evaluation(tmp_path / "run" / "evaluation" / "validation")
+    write_made_up_evaluation(tmp_path / "run" / "evaluation" / "checkpoint-validation", "ppo (last)")
+    for words, names in ((str(tmp_path / "run"), "ppo"), (f"mine={tmp_path / 'run'}", "mine")):
+        collection = collect([words])
+        assert [one.episodes[0].agent for one in collection.evaluations] == [names, f"{names} (last)"]
+    assert not was_evaluated(tmp_path / "run", "test")
+    write_made_up_evaluation(tmp_path / "run" / "evaluation" / "checkpoint-test", "ppo (last)")
+    assert was_evaluated(tmp_path / "run", "test")
+
+
 def test_what_a_run_lacks_is_told(tmp_path):
     write_made_up_run(tmp_path / "run")
     collection = collect([f"mine={tmp_path / 'run'}"])

@@ -9,6 +9,7 @@ from typing import Any
 
 from rich.console import Console
 
+from rl2grid.agents.agent import Agent
 from rl2grid.analysis.comparison_table import reference_table
 from rl2grid.analysis.summary_table import rich_table
 from rl2grid.analysis.table import result_table_rich
@@ -18,6 +19,7 @@ from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import make_agent
 from rl2grid.evaluation.flags import environment_flags, evaluate_command
 from rl2grid.evaluation.protocol import evaluate, first_months
+from rl2grid.records.collection import LAST_POLICY
 from rl2grid.records.evaluations import Evaluation
 from rl2grid.records.methods import group_methods
 from rl2grid.scenarios.splits import TEST
@@ -35,9 +37,9 @@ def run(options: argparse.Namespace) -> int:
         raise UsageError("An agent was named twice: name each once.")
     if options.output is not None and len(agents) > 1:
         raise UsageError("--output is the folder of one agent: leave it out, and each gets a folder of its own.")
-    for agent in agents:  # before anything is played: one that does not exist would be found after an hour of others
-        make_agent(agent, task)
-    results = [_evaluated(agent, task, options) for agent in agents]
+    # Before anything is played: one that does not exist would be found after an hour of others.
+    names = [_name_of_last(agent, make_agent(agent, task)) for agent in agents]
+    results = [_evaluated(agent, name, task, options) for agent, name in zip(agents, names, strict=True)]
     console = Console()
     summaries = [result.summary for result in results]
     console.print(rich_table(summaries, title=f"{task.id}, {options.split} scenarios"))
@@ -56,7 +58,13 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _evaluated(agent: str, task: Task, options: argparse.Namespace) -> Evaluation:
+def _name_of_last(agent: str, made: Agent) -> str | None:
+    """What tables call the last policy of a run, so that it can stand beside the best; None for other agents."""
+    path = Path(agent)
+    return f"{made.name} (last)" if path.is_file() and path.stem == LAST_POLICY else None
+
+
+def _evaluated(agent: str, name: str | None, task: Task, options: argparse.Namespace) -> Evaluation:
     chosen = keywords.given(options)
     return evaluate(
         agent,
@@ -67,6 +75,7 @@ def _evaluated(agent: str, task: Task, options: argparse.Namespace) -> Evaluatio
         workers=options.workers,
         output=options.output or _default_output(agent, options, task.id.removeprefix("rl2grid/"), chosen),
         progress=True,
+        name=name,
         command=evaluate_command(agent, task, options.split, options.seeds, options.months, chosen),
         **chosen,
     )

@@ -30,6 +30,9 @@ from rl2grid.records.studies import (
 from rl2grid.records.trainings import TrainingRun, is_run, read_training_run
 from rl2grid.scenarios.splits import VALIDATION
 
+LAST_POLICY = "checkpoint"
+"""What the evaluations of a run's last policy are named after, which stand beside those of its best."""
+
 
 @dataclass
 class Collection:
@@ -86,7 +89,11 @@ def find_evaluations(folder: Path, split: str) -> list[Path]:
     """The folder itself, or those below it of the split, which 'rl2grid evaluate' names after what else was asked."""
     if is_evaluation(folder):
         return [folder]
-    below = (folder / EVALUATION_FOLDER).glob(f"{split}*")
+    return _evaluations_below(folder, split)
+
+
+def _evaluations_below(folder: Path, name: str) -> list[Path]:
+    below = (folder / EVALUATION_FOLDER).glob(f"{name}*")
     return sorted(path for path in below if is_evaluation(path))
 
 
@@ -94,12 +101,14 @@ def was_evaluated(run: Path, split: str) -> bool:
     """Whether a run, or the cell of a study that it is of, was evaluated on a split."""
     cell = read_cell(run.parent)
     of_cell = cell is not None and cell["split"] == split and is_evaluation(run.parent / EVALUATION_FOLDER)
-    return of_cell or bool(find_evaluations(run, split))
+    return of_cell or bool(find_evaluations(run, split) + _evaluations_below(run, f"{LAST_POLICY}-{split}"))
 
 
 def _add_folder(collection: Collection, folder: Path, label: str | None, split: str) -> None:
     evaluations = find_evaluations(folder, split)
+    last = [] if is_evaluation(folder) else _evaluations_below(folder, f"{LAST_POLICY}-{split}")
     collection.evaluations += [_named(load_evaluation(evaluation), label) for evaluation in evaluations]
+    collection.evaluations += [_named(load_evaluation(one), label and f"{label} (last)") for one in last]
     if is_run(folder):
         run = read_training_run(folder, label)
         collection.runs.append(run)

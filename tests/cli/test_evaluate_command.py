@@ -1,0 +1,60 @@
+"""``rl2grid evaluate``: several agents on the same months, compared; what is played is made up."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from sample_results import result
+
+from rl2grid.cli import evaluate as command
+from rl2grid.cli.main import main
+
+SURVIVALS = {"do-nothing": [[0.1], [0.3], [0.2]], "greedy": [[0.5], [0.8], [0.6]], "random": [[0.1], [0.2], [0.1]]}
+
+
+@pytest.fixture(autouse=True)
+def played(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+    asked: list[dict[str, Any]] = []
+
+    def evaluate(agent: str, task: Any, **options: Any):
+        asked.append({"agent": agent, **options})
+        made = result(agent, SURVIVALS[agent], split=options["split"])
+        return replace(made, folder=options["output"])
+
+    monkeypatch.setattr(command, "evaluate", evaluate)
+    return asked
+
+
+def test_agents_are_compared_with_the_first_on_the_same_months(played, capsys):
+    assert main(["evaluate", "do-nothing", "greedy", "random", "bus14-T0", "--months", "3"]) == 0
+    shown = capsys.readouterr().out
+    assert [one["agent"] for one in played] == ["do-nothing", "greedy", "random"]
+    assert len({tuple(one["scenarios"]) for one in played}) == 1
+    assert "survival, to do-nothing" in shown
+    assert "+0.433" in shown
+    assert "Holm's correction over these 2 comparisons" in " ".join(shown.split())
+    assert "outside of a ledger" not in shown
+
+
+def test_one_agent_is_not_compared_and_a_look_at_test_months_is_told(capsys):
+    assert main(["evaluate", "greedy", "bus14-T0", "--split", "test", "--months", "3"]) == 0
+    shown = capsys.readouterr().out
+    assert "Paired differences" not in shown
+    assert "These test months were looked at outside of a ledger" in shown
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["greedy", "greedy"], "named twice"),
+        (["greedy", "random", "--output", "here"], "--output is the folder of one agent"),
+        (["greedy", "nobody"], "Agent 'nobody'"),
+    ],
+)
+def test_what_cannot_be_played_is_refused_before_anything_is(played, capsys, words, sentence):
+    agents = [word for word in words if word not in ("--output", "here")]
+    assert main(["evaluate", *agents, "bus14-T0", *words[len(agents) :]]) == 2
+    assert sentence in capsys.readouterr().err
+    assert played == []
