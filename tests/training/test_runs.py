@@ -68,6 +68,16 @@ def test_a_run_folder_holds_everything_about_the_run(tmp_path: Path):
     assert "finished at 384 decisions" in (folder / "log.txt").read_text()
 
 
+@pytest.mark.parametrize(("name", "value"), [("targets_version", 1), ("split_version", "1"), ("grid_hash", "0")])
+def test_a_run_of_other_data_or_targets_is_not_resumed(tmp_path: Path, name: str, value: Any):
+    folder = train(request(tmp_path / "run"), evaluate=falling, make_envs=toy_envs)
+    config = json.loads((folder / "config.json").read_text())
+    now, config["identity"][name] = config["identity"][name], value
+    (folder / "config.json").write_text(json.dumps(config))
+    with pytest.raises(UsageError, match=f"cannot be resumed: its {name} was {value}, now it is {now}"):
+        resume(folder, evaluate=falling, make_envs=toy_envs)
+
+
 def test_the_best_policy_by_validation_survival_is_kept(tmp_path: Path):
     folder = train(request(tmp_path / "run"), evaluate=falling, make_envs=toy_envs)
     assert load_agent(folder, "bus14-T0").identity["decisions"] == 96

@@ -20,7 +20,7 @@ from rl2grid.mdp.actions import action_set_hash
 from rl2grid.mdp.constraint_table import CONSTRAINTS, THRESHOLDS
 from rl2grid.records.trainings import RUN_FILE, read_configuration
 from rl2grid.records.versions import TARGETS_VERSION, library_versions
-from rl2grid.scenarios.library import check_in_split, generator_version, scenario_pack_hash
+from rl2grid.scenarios.library import check_in_split, generator_version, scenario_pack_hash, split_version
 from rl2grid.scenarios.splits import TRAIN, VALIDATION, VALIDATION_MONTHS
 from rl2grid.training.tracking import check_tracking
 
@@ -147,6 +147,8 @@ def identity_of(args: RunArgs) -> dict[str, Any]:
         "generator_version": generator_version(task.grid_id, args.env_keywords["split"]),
         "scenario_pack_hash": scenario_pack_hash(task.grid_id, args.env_keywords["split"]),
         "action_set_hash": action_set_hash(task.grid, task.level) if task.kind == "T" else None,
+        # Of the list by which the best policy is picked.
+        "split_version": split_version(task.grid_id, VALIDATION),
         "targets_version": TARGETS_VERSION,
         "budget": {
             "decisions": args.hyperparameters.total_timesteps,

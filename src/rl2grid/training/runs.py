@@ -125,7 +125,7 @@ def resume(
     check_tracking(args.wandb_project)
     with _locked(folder):
         now = identity_of(args)
-        for name in ("grid_hash", "scenario_pack_hash", "action_set_hash", "targets_version"):
+        for name in ("grid_hash", "scenario_pack_hash", "action_set_hash", "split_version", "targets_version"):
             if identity.get(name) != now.get(name):
                 raise UsageError(
                     f"The run in {str(folder)!r} cannot be resumed: its {name} was {identity.get(name)}, "
