@@ -121,7 +121,10 @@ def _add_evaluate(commands: argparse._SubParsersAction[_Parser]) -> None:
     parser.add_argument("--seeds", type=int, default=1, help="episodes per scenario, with seeds 0, 1, ...")
     keywords.add_flags(parser)
     parser.add_argument(
-        "--workers", type=int, default=None, help="processes; by default this one (native) or one per core (reference)"
+        "--workers",
+        type=int,
+        default=None,
+        help="processes; by default this one for few native episodes, or one per core",
     )
     parser.add_argument("--output", type=Path, default=None, help="folder of the results of one agent")
     parser.set_defaults(run=_evaluate)

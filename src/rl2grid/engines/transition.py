@@ -55,8 +55,7 @@ class Transitions:
         self.engine.reset(i, plan)
         self.action_effects[i] = ""
         begin_episode(state, i)
-        if self.heuristic == "careful":
-            remember_nothing(state, i)
+        remember_nothing(state, i)
         self._remember(i)
         self._announce(i)
         self._play_heuristic(i)

@@ -38,6 +38,8 @@ from rl2grid.scenarios.library import (
     split_version,
 )
 
+_MANY_JOBS = 100
+"""Episodes of the native engine that are worth processes of their own."""
 AS_TRAINED = "as trained"
 """Value of ``heuristic``: the one that the policy was trained with; none for agents without training."""
 
@@ -70,8 +72,9 @@ def evaluate(
             (:func:`rl2grid.evaluation.episode.environment_seed`).
         start: row of each scenario at which its episodes begin.
         heuristic: None, ``"idle"``, ``"recovery"``, ``"careful"`` or :data:`AS_TRAINED`.
-        workers: processes that play at the same time; 0: this process plays; None: this one on the native engine,
-            one per processor core on the reference engine. No influence on results.
+        workers: processes that play at the same time; 0: this process plays; None: this one for less than 100 episodes
+            of the native engine, and for agents that are not given by name or path, else one per processor core. No
+            influence on results.
         output: folder to store the evaluation in, and to continue it from; None: nothing is stored.
         progress: whether to show a progress bar with rate and remaining time.
         name: what tables call the agent; None: its own name.
@@ -93,7 +96,7 @@ def evaluate(
         jobs,
         identity=_identity(task, chosen, name or chosen.name, keywords, start, chosen_scenarios),
         command=command or _call(agent, task, keywords, scenarios, seeds, start, name),
-        workers=_number_of_workers(workers, TaskOptions(**keywords).engine),
+        workers=_number_of_workers(workers, TaskOptions(**keywords).engine, agent, len(jobs)),
         output=output,
         progress=progress,
     )
@@ -164,10 +167,12 @@ def env_keywords(agent: Agent, keywords: dict[str, Any]) -> dict[str, Any]:
     return keywords
 
 
-def _number_of_workers(workers: int | None, engine: str) -> int:
+def _number_of_workers(workers: int | None, engine: str, agent: str | Path | Agent, n_jobs: int) -> int:
     if workers is None:
-        # A native episode is over before another process has started.
-        return 0 if engine == "native" else os.cpu_count() or 1
+        # Few native episodes are over before another process has started, and an agent of the caller's own script may
+        # not be known there.
+        is_here = engine == "native" and (n_jobs < _MANY_JOBS or not isinstance(agent, str | Path))
+        return 0 if is_here else os.cpu_count() or 1
     if not isinstance(workers, int) or workers < 0:
         raise UsageError(f"workers={workers!r} is not allowed: give a number of processes, 0 or more.")
     return workers

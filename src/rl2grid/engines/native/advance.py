@@ -87,8 +87,8 @@ def advance(
         if begins:
             reset_row(environments, i)
             begin_episode(state, i)
+            remember_nothing(state, i)
             if heuristic >= CAREFUL:
-                remember_nothing(state, i)
                 remember_topology(state, i)
         else:
             begin_transition(state, i)
