@@ -5,6 +5,7 @@ import pytest
 from made_up_ranking import made_up_arrays, use_ranking
 
 from rl2grid.errors import UsageError
+from rl2grid.evaluation import ranking as ranking_method
 from rl2grid.grids import GRID_IDS, load_grid
 from rl2grid.grids.rankings import ranking, ranking_hash, trials
 
@@ -23,7 +24,7 @@ def test_a_ranking_serves_every_level_below_the_highest(grid_id):
 @pytest.mark.parametrize("grid_id", GRID_IDS)
 def test_a_ranking_tells_how_it_was_made(grid_id):
     metadata = ranking(grid_id).metadata
-    assert metadata["version"] == "1"
+    assert metadata["version"] == ranking_method.VERSION
     assert metadata["command"].startswith(f"rl2grid rank {grid_id} --states ")
     assert metadata["grid"] == grid_id
     assert metadata["split"] == "train"

@@ -35,13 +35,13 @@ from rl2grid.mdp.actions import (
 
 BUS14 = load_grid("bus14")
 HASHES = {
-    "bus14": ("32db315647e91b89", "640acf1573ebb705"),
-    "bus36-M": ("bc5715389322e751", "36f704894eb2efd2"),
-    "bus36-MO-v0": ("cbbff9c9ba42d8dc", "26b3b1ad1c95faae"),
-    "bus36-MO-v1": ("d0dd2bd3cb00e133", "c5ba6a347008ece6"),
+    "bus14": ("b43d481bc44c2cf7", "640acf1573ebb705"),
+    "bus36-M": ("e6672261fb543cab", "36f704894eb2efd2"),
+    "bus36-MO-v0": ("ab4cd913953da8df", "26b3b1ad1c95faae"),
+    "bus36-MO-v1": ("e1a18c7b1a8f3c2c", "c5ba6a347008ece6"),
     "bus118-M": ("aaacdf1097b722eb", "ef59c69aaa872d5a"),
-    "bus118-MOB-v0": ("1be4f214b464b53e", "107c48e82f28113c"),
-    "bus118-MOB-v1": ("c0b46e61b80bb677", "94d7f661f1a9f432"),
+    "bus118-MOB-v0": ("f6d877cd1e7a9fba", "107c48e82f28113c"),
+    "bus118-MOB-v1": ("1a1b921feb11c0e6", "94d7f661f1a9f432"),
 }
 """Of the lowest and the highest level."""
 
