@@ -1,13 +1,15 @@
 """How hard the grids are for an agent that does nothing, and what they look like in their first emergency.
 
-``python benchmarks/tasks.py`` plays the 20 validation months of every grid doing nothing (seed 0, no heuristic), takes
-the first moment of them in which a line is loaded to 95% (:mod:`rl2grid.mdp.heuristics`), and writes
+``python benchmarks/tasks.py [GRID ...] [--months N]`` plays the first N validation months doing nothing (seed 0, no
+heuristic), takes the first moment of them in which a line is loaded to 95% (:mod:`rl2grid.mdp.heuristics`), and writes
 ``benchmarks/results/tasks.json``. The page of the tasks is made of it.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,28 +17,31 @@ import gymnasium
 import numpy as np
 
 import rl2grid  # noqa: F401 - registers the tasks
-from rl2grid.evaluation.protocol import evaluate
+from rl2grid.envs.tasks import find_task
+from rl2grid.evaluation.protocol import evaluate, first_months
 from rl2grid.grids import GRID_IDS
-from rl2grid.scenarios.library import list_scenarios
+from rl2grid.scenarios.splits import VALIDATION
 
 RESULTS = Path(__file__).resolve().parent / "results" / "tasks.json"
 SHOWN = ("topo_vect", "rho", "gen_p", "load_p", "storage_power")
 
 
-def survival(grid_id: str) -> dict[str, Any]:
-    """Mean share of a validation month survived by doing nothing, and the share of months completed."""
-    summary = evaluate("do-nothing", f"{grid_id}-T0", heuristic=None, workers=0).summary
+def survival(grid_id: str, scenarios: Sequence[str]) -> dict[str, Any]:
+    """Mean share of a month survived by doing nothing, and the share of months completed."""
+    task = f"{grid_id}-T0"
+    summary = evaluate("do-nothing", task, scenarios=scenarios, heuristic=None, workers=0, progress=True).summary
     return {
+        "months": len(scenarios),
         "survival": round(summary.survival.value, 4),
         "interval": [round(summary.survival.low, 4), round(summary.survival.high, 4)],
         "completed": round(summary.completed.value, 3),
     }
 
 
-def first_emergency(grid_id: str) -> dict[str, Any]:
-    """The grid at the first decision of the first validation month that has one, with the idle heuristic."""
-    for scenario in list_scenarios(grid_id, "validation"):
-        env = gymnasium.make(f"rl2grid/{grid_id}-T0-v0", heuristic="idle", split="validation", scenario=scenario)
+def first_emergency(grid_id: str, scenarios: Sequence[str]) -> dict[str, Any]:
+    """The grid at the first decision of the first month that has one, with the idle heuristic."""
+    for scenario in scenarios:
+        env = gymnasium.make(f"rl2grid/{grid_id}-T0-v0", heuristic="idle", split=VALIDATION, scenario=scenario)
         _, info = env.reset(seed=0)
         if info["over"]:
             continue
@@ -47,12 +52,18 @@ def first_emergency(grid_id: str) -> dict[str, Any]:
 
 
 def main() -> None:
-    results: dict[str, Any] = {}
-    for grid_id in GRID_IDS:
-        results[grid_id] = {"do_nothing": survival(grid_id), "moment": first_emergency(grid_id)}
-        print(grid_id, results[grid_id]["do_nothing"], results[grid_id]["moment"]["step"], flush=True)
-    lines = [f"{json.dumps(grid_id)}: {json.dumps(result)}" for grid_id, result in results.items()]
-    RESULTS.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("grids", nargs="*", default=list(GRID_IDS))
+    parser.add_argument("--months", type=int, default=None, help="by default all")
+    arguments = parser.parse_args()
+    for grid_id in arguments.grids:
+        scenarios = first_months(find_task(f"{grid_id}-T0"), VALIDATION, arguments.months)
+        measured = {"do_nothing": survival(grid_id, scenarios), "moment": first_emergency(grid_id, scenarios)}
+        print(grid_id, measured["do_nothing"], measured["moment"]["step"], flush=True)
+        results = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else {}
+        results[grid_id] = measured
+        lines = [f"{json.dumps(each)}: {json.dumps(results[each])}" for each in GRID_IDS if each in results]
+        RESULTS.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -182,4 +182,5 @@ def _ordinal(number: int) -> str:
 
 def _survival(result: dict[str, Any]) -> str:
     numbers = result["do_nothing"]
-    return f"{numbers['survival']:.3f} [{numbers['interval'][0]:.3f}, {numbers['interval'][1]:.3f}]"
+    low, high = numbers["interval"]
+    return f"{numbers['survival']:.3f} [{low:.3f}, {high:.3f}] ({numbers['months']} months)"

@@ -17,7 +17,7 @@ from rl2grid.algorithms.registry import (
     register_algorithm,
 )
 from rl2grid.errors import UsageError
-from rl2grid.studies.tuning import search_space
+from rl2grid.studies.tuning import WEIGHT_CHOICES, search_space
 from rl2grid.training.request import hyperparameters
 
 OURS = ("ppo", "lagrangian-ppo", "dqn", "sac", "td3")
@@ -72,7 +72,7 @@ def test_one_of_a_users_own_stands_beside_them(mine: Algorithm):
     assert algorithm_names() == (*OURS, "mine")
     assert algorithms_for("R")[-1] == "mine"
     assert hyperparameters("mine", "bus14-R", seed=3) == Args(seed=3)
-    assert search_space("mine") == {"gamma": [0.1]}
+    assert search_space("mine") == {"gamma": [0.1], **{name: list(values) for name, values in WEIGHT_CHOICES.items()}}
     with pytest.raises(UsageError, match=r"'mine' cannot learn .* discrete actions: choose one of ppo, lagrangian-ppo"):
         hyperparameters("mine", "bus14-T0")
 

@@ -128,7 +128,7 @@ class Singles:
 @pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize("heuristic", HEURISTICS)
 def test_equals_single_environments_put_together_by_gymnasium(task, heuristic):
-    seeds = [3, 4, 5]
+    seeds = [3, 4, 7]
     keywords = {"heuristic": heuristic, "gamma": 0.99}
     vector = make_vector(task, len(seeds), **keywords)
     mine = play(vector, seeds, 40)
