@@ -113,7 +113,6 @@ def _play(subject: Subject, agent: str | Path) -> Evaluation:
         split=TEST,
         scenarios=first_months(subject.task, TEST, subject.configuration["test"]["months"]),
         heuristic=AS_TRAINED if subject.training else subject.heuristic,
-        workers=0,
         progress=True,
     )
 
