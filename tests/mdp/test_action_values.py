@@ -39,7 +39,7 @@ HASHES = {
     "bus36-M": ("e6672261fb543cab", "36f704894eb2efd2"),
     "bus36-MO-v0": ("ab4cd913953da8df", "26b3b1ad1c95faae"),
     "bus36-MO-v1": ("e1a18c7b1a8f3c2c", "c5ba6a347008ece6"),
-    "bus118-M": ("aaacdf1097b722eb", "ef59c69aaa872d5a"),
+    "bus118-M": ("be081cd75f509d30", "ef59c69aaa872d5a"),
     "bus118-MOB-v0": ("f6d877cd1e7a9fba", "107c48e82f28113c"),
     "bus118-MOB-v1": ("1a1b921feb11c0e6", "94d7f661f1a9f432"),
 }
