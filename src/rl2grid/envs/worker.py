@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import os
 import pickle
-import signal
 import subprocess
 import sys
 import traceback
@@ -21,6 +20,7 @@ from rl2grid.envs.options import TaskOptions
 from rl2grid.envs.registration import own_systems, register_system
 from rl2grid.envs.tasks import Task
 from rl2grid.errors import UsageError
+from rl2grid.processes import take_standard_streams
 
 
 class Worker:
@@ -108,15 +108,6 @@ def serve(requests: BinaryIO, answers: BinaryIO) -> None:
         answers.flush()
     if rows is not None:
         rows.close()
-
-
-def take_standard_streams() -> tuple[BinaryIO, BinaryIO]:
-    """Where a worker process reads requests and writes answers; what a library prints goes to the standard error."""
-    answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-    # An interrupt from the keyboard reaches the whole group: the parent decides when workers end.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    return sys.stdin.buffer, answers
 
 
 def main() -> None:

@@ -23,9 +23,9 @@ import gymnasium
 
 from rl2grid.agents.agent import Action, Agent, Info
 from rl2grid.envs.registration import own_systems, register_all, register_system
-from rl2grid.envs.worker import take_standard_streams
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.episode import play_episode
+from rl2grid.processes import kill, take_standard_streams
 from rl2grid.records.episodes import Episode
 
 _REPORT_SECONDS = 0.5
@@ -216,15 +216,7 @@ class _Worker:
 
     def kill(self) -> None:
         """End the process, whatever it is doing."""
-        self._process.kill()
-        self._process.wait()
-        self._thread.join()
-        for pipe in (self._process.stdin, self._process.stdout):
-            assert pipe is not None
-            try:
-                pipe.close()
-            except BrokenPipeError:  # what was not sent yet is lost with the process
-                continue
+        kill(self._process, self._thread)
 
     def _send(self, value: Any) -> None:
         assert self._process.stdin is not None

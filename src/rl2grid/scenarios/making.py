@@ -5,7 +5,6 @@ Months that are missing are otherwise made one by one where they are first asked
 
 from __future__ import annotations
 
-import contextlib
 import os
 import pickle
 import queue
@@ -18,6 +17,7 @@ from typing import NamedTuple
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid, System, find_system
 from rl2grid.grids.systems import add_system
+from rl2grid.processes import kill, take_standard_streams
 from rl2grid.scenarios.generated import make_months, pack_path
 
 FEW_YEARS = 6
@@ -99,20 +99,13 @@ class _Maker:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             env=os.environ | _ONE_THREAD,
-            start_new_session=True,  # an interrupt from the keyboard is the parent's to handle
         )
         self._thread = threading.Thread(target=self._ask, args=(system, waiting, made), daemon=True)
         self._thread.start()
 
     def stop(self) -> None:
         """End the process, whatever it is doing; what it was writing is not kept."""
-        self._process.kill()
-        self._process.wait()
-        self._thread.join()
-        for pipe in (self._process.stdin, self._process.stdout):
-            assert pipe is not None
-            with contextlib.suppress(BrokenPipeError):
-                pipe.close()
+        kill(self._process, self._thread)
 
     def _ask(self, system: System, waiting: queue.SimpleQueue[Year], made: queue.SimpleQueue[int | str]) -> None:
         assert self._process.stdin is not None
@@ -132,9 +125,8 @@ class _Maker:
 
 
 def main() -> None:
-    """Make the years that are asked for on the standard input; what is printed meanwhile goes to standard error."""
-    requests, answers = sys.stdin.buffer, os.fdopen(os.dup(sys.stdout.fileno()), "wb")
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    """Make the years that are asked for on the standard input."""
+    requests, answers = take_standard_streams()
     system: System = pickle.load(requests)
     add_system(system)
     while True:
