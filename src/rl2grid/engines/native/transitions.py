@@ -248,8 +248,10 @@ class NativeTransitions(Transitions):
         list(self._threads.map(advance_slice, range(parts), slices))
 
     def _addresses(self, thread: int) -> tuple[int, int]:
-        """The environments, and where a heuristic may try things, for one thread."""
-        return self.engine.address_for(thread), self.engine.trial_address_for(thread)
+        """The environments, and where the careful heuristic may try things, for one thread."""
+        address = self.engine.address_for(thread)
+        # No other heuristic looks there.
+        return address, self.engine.trial_address_for(thread) if self.heuristic == "careful" else address
 
     def _advance_part(self, thread: int, rows: I64, commands: Commands, begins: bool) -> None:
         weights = self.reward.weights
