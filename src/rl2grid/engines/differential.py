@@ -256,10 +256,14 @@ class SideBySide:
         accrue(state, i, survive, overload, cost, self._reward.weights, 1.0)
 
     def _disagree(self, action: str, before: NDArray[np.float32]) -> bool:
-        if not self._comparison.find(0, self._row):
+        if not self._differs():
             return False
         self._note(self._comparison, self._row, action, 0, before)
         return True
+
+    def _differs(self) -> bool:
+        """Whether the engines show other values after the last step."""
+        return self._comparison.find(0, self._row)
 
     def _note(self, comparison: _Comparison, j: int, action: str, horizon: int, before: NDArray[np.float32]) -> None:
         differences = list(comparison.differences(0, j))
@@ -339,11 +343,8 @@ class TransitionsSideBySide(SideBySide):
                 break
         return int(state.step[i])
 
-    def _disagree(self, action: str, before: NDArray[np.float32]) -> bool:
-        if not (self._comparison.find(0, self._row) or self._sums_differ()):
-            return False
-        self._note(self._comparison, self._row, action, 0, before)
-        return True
+    def _differs(self) -> bool:
+        return super()._differs() or self._sums_differ()
 
     def _sums_differ(self) -> bool:
         """Whether what adds up over the steps of a transition differs by more than its steps may."""

@@ -13,7 +13,7 @@ from rl2grid.compile import jit
 from rl2grid.engines.native.action_notes import note_action
 from rl2grid.engines.native.environments import Environments, open_environments
 from rl2grid.engines.native.orders import Orders, order_one_change
-from rl2grid.engines.native.simulation import begin_simulation, finish_simulation
+from rl2grid.engines.native.simulation import begin_simulation, copy_environment, finish_simulation
 from rl2grid.engines.native.step import begin_step, dispatch_or_lose, finish_step, reset_row
 from rl2grid.mdp.accumulate import accrue, begin_episode, begin_transition, end_reset
 from rl2grid.mdp.actions import ActionKind
@@ -31,7 +31,6 @@ from rl2grid.mdp.heuristics import (
 )
 from rl2grid.mdp.rewards import default_components, paper_components, released_components
 from rl2grid.mdp.state import GridState
-from rl2grid.structures import copy_row
 
 ALONE, IDLE, RECOVERY, RECONNECT, CAREFUL, CAREFUL_RECONNECT = range(6)
 """Who plays between two decisions: nobody, or a heuristic (recovery and careful only reconnect on continuous tasks)."""
@@ -167,9 +166,7 @@ def _careful_action(environments: Environments, simulated: int, i: int, only_lin
 @jit
 def _forecast_allows(environments: Environments, trial: Environments, i: int, kind: int, target: int) -> bool:
     """Whether the careful heuristic may play an action in row ``i``; tried in row 0 of ``trial``."""
-    copy_row(environments.state, i, trial.state, 0)
-    copy_row(environments.hidden, i, trial.hidden, 0)
-    copy_row(environments.flow, i, trial.flow, 0)
+    copy_environment(environments, i, trial, 0)
     order_one_change(trial.orders, 0, kind, target)
     if begin_simulation(trial, environments, i, 1, True) and not dispatch_or_lose(trial, 0):
         return False

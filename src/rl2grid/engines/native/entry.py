@@ -5,9 +5,8 @@ from __future__ import annotations
 from rl2grid.compile import jit
 from rl2grid.engines.native.environments import open_environments
 from rl2grid.engines.native.generation import set_generators
-from rl2grid.engines.native.simulation import begin_simulation, finish_simulation
+from rl2grid.engines.native.simulation import begin_simulation, copy_environment, finish_simulation
 from rl2grid.engines.native.step import begin_step, dispatch_or_lose, finish_step, lose_by_dispatch, reset_row
-from rl2grid.structures import copy_row
 
 
 @jit
@@ -70,7 +69,4 @@ def finish_simulation_one(address: int) -> None:
 @jit
 def copy_one(source: int, i: int, target: int, j: int) -> None:
     """Bring environment ``j`` of another engine of the grid to where ``i`` is, for a step without opponent."""
-    here, there = open_environments(source), open_environments(target)
-    copy_row(here.state, i, there.state, j)
-    copy_row(here.hidden, i, there.hidden, j)
-    copy_row(here.flow, i, there.flow, j)
+    copy_environment(open_environments(source), i, open_environments(target), j)

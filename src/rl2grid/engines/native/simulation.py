@@ -11,8 +11,17 @@ from rl2grid.engines.native.series import read_forecast
 from rl2grid.engines.native.step import play_order, prepare_dispatch, run_and_register
 from rl2grid.engines.native.topology import judge_order, open_line
 from rl2grid.mdp.state import GridState
+from rl2grid.structures import copy_row
 
 _FULL_LOAD = np.float32(1.0)
+
+
+@jit
+def copy_environment(source: Environments, i: int, target: Environments, j: int) -> None:
+    """Bring row ``j`` of another engine of the grid to where row ``i`` is, for a step without opponent."""
+    copy_row(source.state, i, target.state, j)
+    copy_row(source.hidden, i, target.hidden, j)
+    copy_row(source.flow, i, target.flow, j)
 
 
 @jit
