@@ -1,4 +1,4 @@
-"""What the generator knows of each grid, fitted to the bundled series by ``benchmarks/scenarios.py calibrate``."""
+"""What the generator knows of each grid, fitted to the bundled series by ``benchmarks/calibration.py``."""
 
 from __future__ import annotations
 
