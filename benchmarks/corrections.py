@@ -44,7 +44,7 @@ validations = 5
 algorithms = ["ppo"]
 tasks = ["bus14-T0"]
 heuristics = ["idle", "{closing}"]
-budget = 98_304
+budget = 49_152
 
 [[group]]
 algorithms = ["dqn", "sac"]
@@ -56,7 +56,7 @@ budget = 20_480
 algorithms = ["ppo"]
 tasks = ["bus36-MO-v0-T0"]
 heuristics = ["{closing}"]
-budget = 98_304
+budget = 49_152
 
 [[group]]
 algorithms = ["dqn", "sac"]
@@ -106,7 +106,7 @@ def read_scores(folder: Path) -> dict[Setting, dict[tuple[str, str], list[float]
         rows = sorted(csv.DictReader(file), key=lambda row: int(row["training_seed"]))
     for row in rows:
         heuristic = "careful" if row["heuristic"] == closing else row["heuristic"]
-        setting = (row["cell"].split("-")[0], row["task"], heuristic)
+        setting = (row["agent"], row["task"], heuristic)
         found[setting][row["scenario"], row["seed"]].append(float(row["survival"]))
     return found
 
