@@ -3,8 +3,11 @@
 import pytest
 from documentation import PAGES, ROOT, anchors, files_named, links, name_of
 
+BESIDE_THE_README = ("CHANGELOG.md", "CODE_OF_CONDUCT.md", "CONTRIBUTING.md", "SECURITY.md")
+EVERY_PAGE = (*PAGES, *(ROOT / name for name in BESIDE_THE_README))
 
-@pytest.mark.parametrize("page", PAGES, ids=name_of)
+
+@pytest.mark.parametrize("page", EVERY_PAGE, ids=name_of)
 def test_links_lead_somewhere(page):
     broken = []
     for link in links(page):
@@ -21,7 +24,7 @@ def test_links_lead_somewhere(page):
     assert not broken
 
 
-@pytest.mark.parametrize("page", PAGES, ids=name_of)
+@pytest.mark.parametrize("page", EVERY_PAGE, ids=name_of)
 def test_files_that_are_named_exist(page):
     # Pages name files from the root, from the package, or from the tests.
     roots = (ROOT, ROOT / "src", ROOT / "src" / "rl2grid", ROOT / "tests", ROOT / "docs", page.parent)
