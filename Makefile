@@ -11,13 +11,14 @@ WORKERS ?= 2
 # The theme announces its successor at every build.
 export NO_MKDOCS_2_WARNING := 1
 
-.PHONY: help demo docs test test-slow lint clean
+.PHONY: help demo docs test test-slow lint release clean
 
 help:
 	@echo "make demo       train PPO on bus14, evaluate it, write reports/demo (a few minutes)"
 	@echo "make test       linters, types, layers and the tests (six minutes on two cores; twelve the first time, which compiles)"
 	@echo "make test-slow  the longer tests too, the code blocks of the documentation among them"
 	@echo "make docs       build the documentation into site/ (half a minute), to be opened as site/index.html"
+	@echo "make release    tests, builds and tries out the packages, and stops before the upload"
 	@echo "make clean      remove the virtual environment and what was made"
 
 $(VENV)/.installed: pyproject.toml constraints.txt
@@ -52,6 +53,9 @@ test: lint
 
 test-slow: $(VENV)/.installed-examples
 	@$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
+
+release: $(VENV)/.installed
+	@$(BIN)/python scripts/release.py
 
 clean:
 	rm -rf $(VENV) reports runs site .pytest_cache .mypy_cache .ruff_cache .import_linter_cache
