@@ -28,10 +28,10 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --progress-bar on --no-compile --constraint constraints.txt --editable ".[train,analysis,docs,dev]"
 	@touch $@
 
-# RLlib and TorchRL are large, and a browser is driven by the longer tests alone.
+# RLlib and TorchRL are large; a browser and notebooks are driven by the longer tests alone.
 $(VENV)/.installed-examples: $(VENV)/.installed
-	@echo "== Installing the libraries of the examples and of the tests in a browser (about a minute)"
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --progress-bar on --no-compile --constraint constraints.txt --editable ".[examples,browser]"
+	@echo "== Installing the libraries of the examples, of the notebooks and of the tests in a browser (about a minute)"
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --progress-bar on --no-compile --constraint constraints.txt --editable ".[examples,browser,notebooks]"
 	@touch $@
 
 demo: $(VENV)/.installed
