@@ -1,4 +1,4 @@
-"""Agents by name, or from a checkpoint."""
+"""Agents by name, from a checkpoint, or of a user's own code."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from rl2grid.agents.random_agent import RandomAgent
 from rl2grid.agents.recovery import Recovery
 from rl2grid.envs.tasks import Task
 from rl2grid.errors import one_of
+from rl2grid.evaluation.own_agents import is_own, load_own_agent
 
 AGENTS: dict[str, Callable[[], Agent]] = {
     DoNothing.name: DoNothing,
@@ -38,7 +39,8 @@ def make_agent(spec: str | Path, task: Task | None = None) -> Agent:
     """The agent that ``spec`` asks for.
 
     Args:
-        spec: a name of :data:`AGENTS`, or the path of a checkpoint or of a run folder.
+        spec: a name of :data:`AGENTS`, the path of a checkpoint or of a run folder, or where an agent of one's own is
+            written, as ``package.module:Agent`` or ``./agent.py`` (:mod:`rl2grid.evaluation.own_agents`).
         task: the task that the agent is to play; checkpoints of other tasks are refused.
 
     Raises:
@@ -46,9 +48,12 @@ def make_agent(spec: str | Path, task: Task | None = None) -> Agent:
     """
     if isinstance(spec, str) and spec in AGENTS:
         return AGENTS[spec]()
+    if is_own(str(spec)):
+        return load_own_agent(str(spec))
     path = Path(spec)
     if not path.exists():
-        raise one_of("Agent", str(spec), (*AGENTS, "the path of a checkpoint", "the path of a run folder"))
+        others = ("the path of a checkpoint", "the path of a run folder", "package.module:Agent", "./agent.py")
+        raise one_of("Agent", str(spec), (*AGENTS, *others))
     # Imported here: agents without training run without torch.
     from rl2grid.algorithms.policy_agent import load_agent
 

@@ -31,7 +31,10 @@ from rl2grid.records.episodes import Episode
 _REPORT_SECONDS = 0.5
 
 _WORKER = "from rl2grid.evaluation.crew import main; main()"
-"""Not ``python -m``: what a worker sends must be of the classes of this module, not of a ``__main__``."""
+"""Not ``python -m``: what a worker sends must be of the classes of this module, not of a ``__main__``.
+
+With ``-P``, so that no file of the working folder takes the place of a library's; the path of this process is sent.
+"""
 _ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 """Workers are the parallelism: threads of theirs would only compete."""
 
@@ -199,13 +202,14 @@ class _Worker:
         """What it plays."""
         self._answers = answers
         self._process = subprocess.Popen(
-            [sys.executable, "-c", _WORKER],
+            [sys.executable, "-P", "-c", _WORKER],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             env=os.environ | _ONE_THREAD,
         )
         self._thread = threading.Thread(target=self._collect, daemon=True)
         self._thread.start()
+        self._send(sys.path)
         self._send(own_systems())
         self._send(setting)
 
@@ -245,6 +249,8 @@ def serve(requests: BinaryIO, answers: BinaryIO) -> None:
         answers.flush()
 
     try:
+        # Before anything that is of the caller's own modules.
+        sys.path += [folder for folder in pickle.load(requests) if folder not in sys.path]
         for system in pickle.load(requests):
             register_system(system)
         bound = BoundAgent(pickle.load(requests))

@@ -28,7 +28,7 @@ def play_to_watch(
     """Play and record one episode; it is the one that an evaluation with the same seed plays.
 
     Args:
-        agent: a name, run folder or checkpoint; see :func:`rl2grid.evaluation.agents.make_agent`.
+        agent: a name, run folder, checkpoint or agent of one's own; see :func:`rl2grid.evaluation.agents.make_agent`.
         task: the task, or its id, whose namespace and version may be left out.
         split: whose scenario is played.
         scenario: None: the first of the split.
