@@ -17,7 +17,7 @@ from rl2grid.training.commands import training_command
 from rl2grid.training.request import read_config
 
 TRAINING = [
-    *("train", "ppo", "bus14-T0", "--heuristic", "idle", "--total-timesteps", "256", "--num-envs", "4", "--num-steps"),
+    *("train", "ppo", "bus14-T0", "--heuristic", "idle", "--decisions", "256", "--num-envs", "4", "--num-steps"),
     *("32", "--actor-layers", "8", "8", "--no-normalize-advantages", "--evaluate-every", "256", "--seed", "3"),
 ]
 
@@ -25,7 +25,7 @@ TRAINING = [
 @pytest.mark.slow
 def test_a_run_can_be_made_again_reported_and_handed_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = tmp_path / "run"
-    assert main([*TRAINING, "--folder", str(run)]) == 0
+    assert main([*TRAINING, "--output", str(run)]) == 0
     command = training_command(run)
     for word in ("--num-steps 32", "--actor-layers 8 8", "--no-normalize-advantages", "--evaluate-every 256"):
         assert word in command

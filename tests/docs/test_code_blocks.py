@@ -68,7 +68,7 @@ def test_commands_exist_with_their_flags(block, line, monkeypatch):
     if hasattr(options, "task"):
         find_task(options.task)
     if getattr(options, "agent", None) is not None:
-        assert options.agent in AGENTS or options.agent.startswith("runs/")
+        assert options.agent in AGENTS or options.agent.startswith(("runs/", "examples/"))
 
 
 @pytest.mark.slow

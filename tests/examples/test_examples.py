@@ -2,6 +2,7 @@
 
 import ast
 import importlib.util
+import json
 import os
 import re
 import runpy
@@ -11,6 +12,8 @@ import sys
 from pathlib import Path
 
 import pytest
+
+from rl2grid.cli.main import main
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 NEEDS = {
@@ -68,8 +71,27 @@ def test_is_short_and_says_how_to_install(path):
 
 
 def test_every_example_is_run():
-    ran = {*NEEDS, "graph_observations"}
+    ran = {*NEEDS, "graph_observations", "lowest_loading"}
     assert {path.stem for path in EXAMPLES.glob("*.py")} == ran
+
+
+def test_an_agent_in_a_file_is_played(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    words = [
+        "evaluate",
+        str(EXAMPLES / "lowest_loading.py"),
+        "bus14-T0",
+        "--months",
+        "1",
+        "--heuristic",
+        "idle",
+        "--json",
+    ]
+    assert main(words) == 0
+    (summary,) = json.loads(capsys.readouterr().out)["summaries"]
+    assert summary["agent"] == "lowest-loading"
+    assert summary["survival"]["value"] > 0.5
 
 
 def test_graph_observations_without_pytorch_geometric(monkeypatch, capsys):

@@ -10,7 +10,8 @@ import pytest
 from rich.console import Console
 from sample_results import episode, result
 
-from rl2grid.analysis.summary_table import HEADINGS, markdown_table, rich_table
+from rl2grid.analysis.summary_table import HEADINGS, markdown_table, summary_table
+from rl2grid.analysis.table import result_table_rich
 from rl2grid.errors import UsageError
 from rl2grid.records.episodes import COLUMN_NAMES, read_episodes, write_episodes
 from rl2grid.records.evaluations import check_comparable, load_evaluation, write_evaluation
@@ -114,7 +115,8 @@ def test_tables_name_the_best():
     console = Console(width=80)
     with console.capture() as captured:
         others = [result("do-nothing", [[0.5, 0.1]], "idle"), result("lagrangian-ppo-of-mine", [[0.5]], "recovery")]
-        console.print(rich_table([*summaries, *(other.summary for other in others)], "Results"))
+        table = summary_table([*summaries, *(other.summary for other in others)])
+        console.print(result_table_rich(table, "Results"))
     text = captured.get()
     assert "50%" in text
     assert "[5, 95]" in text

@@ -17,7 +17,12 @@ def test_the_command_asks_for_the_same_demonstration(
     output: Path, decisions: int | None, monkeypatch: pytest.MonkeyPatch
 ):
     asked: list[tuple[Path, int | None]] = []
-    monkeypatch.setattr(demo, "run_demo", lambda output, decisions: asked.append((output, decisions)))
+
+    def listen(output: Path, decisions: int | None, *, progress: bool) -> demo.Demonstration:
+        asked.append((output, decisions))
+        return demo.Demonstration(output / "report.html", ())
+
+    monkeypatch.setattr(demo, "run_demo", listen)
     words = shlex.split(demo.demo_command(output, decisions))
     assert words[0] == "rl2grid"
     assert main(words[1:]) == 0

@@ -211,7 +211,7 @@ def test_failures_are_tried_again_refusals_are_not_and_the_others_go_on(tmp_path
     stored = json.loads((tmp_path / "study.json").read_text())
     assert {entry["state"] for entry in stored["cells"]} == {"done"}
     assert stored["cells"][0]["commands"][0].startswith(
-        "rl2grid train ppo bus14-T0 --total-timesteps 1024 --evaluate-every 102 --validation-months 2 --folder"
+        "rl2grid train ppo bus14-T0 --decisions 1024 --evaluate-every 102 --validation-months 2 --output"
     )
     assert stored["cells"][0]["commands"][1].endswith("--split test --seeds 1 --months 2 --heuristic None")
 

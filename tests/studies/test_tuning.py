@@ -214,7 +214,7 @@ def test_a_search_finds_the_best_of_its_trials_and_is_gone_on_with(tmp_path: Pat
     assert best is not None
     stored = json.loads((tmp_path / "best.json").read_text())
     assert stored["survival"] == best.survival > 0.0
-    assert best_command(tuning, best).startswith("rl2grid train ppo bus14-T0 --total-timesteps 512")
+    assert best_command(tuning, best).startswith("rl2grid train ppo bus14-T0 --decisions 512")
     runs = set((tmp_path / "trials").iterdir())
     again = run_tuning(tuning, 1)
     assert again == best

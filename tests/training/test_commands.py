@@ -76,8 +76,8 @@ def test_a_run_without_validation_is_resumed_and_made_again_without(tmp_path: Pa
     original, folder = runs.train, tmp_path / "run"
     monkeypatch.setattr(runs, "train", train)
     monkeypatch.setattr(runs, "resume", resume)
-    sizes = ["--num-envs", "4", "--num-steps", "8", "--total-timesteps", "32"]
-    asked = ["ppo", "bus14-T0", *sizes, "--validation-months", "0", "--folder", str(folder)]
+    sizes = ["--num-envs", "4", "--num-steps", "8", "--decisions", "32"]
+    asked = ["ppo", "bus14-T0", *sizes, "--validation-months", "0", "--output", str(folder)]
     assert command.train(asked) == 0
     assert command.train(["--resume", str(folder)]) == 0
     assert heard == [None, None]

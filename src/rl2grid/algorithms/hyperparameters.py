@@ -78,7 +78,7 @@ class SharedArgs:
             raise UsageError(f"{self.algorithm} with gamma 1 needs a reward_scale, because 1 - gamma would be zero.")
         if self.total_timesteps < self.num_envs * self.num_steps:
             raise UsageError(
-                f"{self.algorithm} needs total_timesteps of at least num_envs * num_steps = "
+                f"{self.algorithm} needs total_timesteps (--decisions) of at least num_envs * num_steps = "
                 f"{self.num_envs * self.num_steps}, not {self.total_timesteps}."
             )
 

@@ -14,14 +14,13 @@ from typing import NamedTuple
 
 import matplotlib
 import numpy as np
-import rich.box
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from rich.table import Table
 
 from rl2grid.analysis import page
 from rl2grid.analysis.figures import png_bytes
+from rl2grid.analysis.table import Cell, Column, ResultTable
 from rl2grid.arrays import F64
 from rl2grid.drawing.theme import DARK, LIGHT, Theme, style
 from rl2grid.errors import UsageError
@@ -174,14 +173,11 @@ def distance(one: F64, other: F64) -> float:
     return float(np.abs(shares[0] - shares[1]).max())
 
 
-def rich_table(comparison: Comparison) -> Table:
-    """The table for the terminal."""
-    table = Table(title=f"Series of {comparison.grid_id}", title_justify="left", box=rich.box.SIMPLE_HEAD)
-    for number, heading in enumerate(HEADINGS):
-        table.add_column(heading, justify="left" if number < 2 else "right", no_wrap=True)
-    for cells in table_rows(comparison):
-        table.add_row(*cells)
-    return table
+def check_table(comparison: Comparison) -> ResultTable:
+    """The table that the command line prints."""
+    columns = tuple(Column(heading, words=number < 2) for number, heading in enumerate(HEADINGS))
+    rows = tuple(tuple(Cell(text) for text in cells) for cells in table_rows(comparison))
+    return ResultTable("quantities", "", columns, rows)
 
 
 HEADINGS = ("quantity", "source", "mean", "deviation", "5%", "median", "95%", "after 1 h", "distance")

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import rich.box
-from rich.table import Table
-
-from rl2grid.analysis.table import markdown_row, share_text, with_interval
+from rl2grid.analysis.table import Cell, Column, ResultTable, markdown_row, share_text, with_interval
 from rl2grid.records.statistics import Estimate
 from rl2grid.records.summary import Summary
 
@@ -58,33 +55,36 @@ def table_cells(summary: Summary) -> list[str]:
     ]
 
 
-def rich_table(summaries: Sequence[Summary], title: str | None = None) -> Table:
-    """A table for the terminal, 80 characters wide: intervals stand below; the best survival is bold.
+def summary_table(summaries: Sequence[Summary]) -> ResultTable:
+    """The columns that fit 80 characters, intervals below their values; the best survival is bold.
 
     "Done" is the share of episodes completed.
     """
-    table = Table(
-        title=title,
-        title_justify="left",
-        title_style="bold",
-        box=rich.box.SIMPLE_HEAD,
-        pad_edge=False,
-        padding=(0, 1, 0, 0),
-    )
-    table.add_column("agent", overflow="fold")
-    for heading in ("survival", "done", "return", "LSI\ncost", "safe\nLSI", "TLO\ncost", "safe\nTLO"):
-        table.add_column(heading, justify="right", no_wrap=True)
+    columns = {
+        "survival": "survival",
+        "completed": "done",
+        "return": "return",
+        "LSI cost": "LSI cost",
+        "safe LSI": "safe LSI",
+        "TLO cost": "TLO cost",
+        "safe TLO": "safe TLO",
+    }
+    rows = []
     for summary in summaries:
         cells = dict(zip(HEADINGS, table_cells(summary), strict=True))
-        table.add_row(
-            summary.agent if summary.heuristic == "none" else f"{summary.agent}\n+ {summary.heuristic}",
-            *(
-                cells[name].replace(" [", "\n[")
-                for name in ("survival", "completed", "return", "LSI cost", "safe LSI", "TLO cost", "safe TLO")
-            ),
-            style="bold" if is_best(summary, summaries) else None,
+        best = is_best(summary, summaries)
+        rows.append(
+            (
+                Cell(agent_words(summary), best=best),
+                *(Cell(cells[name], best=best) for name in columns),
+            )
         )
-    return table
+    return ResultTable("summaries", "", (Column("agent", words=True), *map(Column, columns.values())), tuple(rows))
+
+
+def agent_words(summary: Summary) -> str:
+    """The agent with the heuristic that it played with, as "PPO + idle"."""
+    return summary.agent if summary.heuristic == "none" else f"{summary.agent} + {summary.heuristic}"
 
 
 def markdown_table(summaries: Sequence[Summary]) -> str:

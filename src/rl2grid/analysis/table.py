@@ -8,13 +8,13 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import rich.box
-from rich.table import Table
-from rich.text import Text
+if TYPE_CHECKING:
+    from rich.table import Table
 
-from rl2grid.records.comparisons import Difference
-from rl2grid.records.statistics import Estimate
+    from rl2grid.records.comparisons import Difference
+    from rl2grid.records.statistics import Estimate
 
 
 @dataclass(frozen=True)
@@ -96,8 +96,45 @@ def p_cell(difference: Difference) -> Cell:
     return Cell("< 0.001" if difference.holm < 0.001 else f"{difference.holm:.3f}")
 
 
+def table_text(table: ResultTable, title: str = "") -> str:
+    """A table as lines of text, one per row, as wide as its values are: for pipes, files and wide terminals."""
+    head = [_heading(column) for column in table.columns]
+    lines = [head, *([cell.text for cell in row] for row in table.rows)]
+    widths = [max(len(line[k]) for line in lines) for k in range(len(head))]
+    shown = [
+        "  ".join(
+            text.ljust(width) if column.words else text.rjust(width)
+            for text, width, column in zip(line, widths, table.columns, strict=True)
+        ).rstrip()
+        for line in lines
+    ]
+    return "\n".join([*([title] if title else []), *shown, *([table.caption] if table.caption else [])])
+
+
+def table_records(table: ResultTable) -> list[dict[str, object]]:
+    """The rows of a table by the headings of its columns, for programs: an estimate with all digits, else the text."""
+    return [
+        {_heading(column): _record(cell) for column, cell in zip(table.columns, row, strict=True)} for row in table.rows
+    ]
+
+
+def _heading(column: Column) -> str:
+    return f"{column.group} {column.heading}".strip()
+
+
+def _record(cell: Cell) -> object:
+    if cell.estimate is None:
+        return cell.text
+    return {"value": cell.estimate.value, "low": cell.estimate.low, "high": cell.estimate.high}
+
+
 def result_table_rich(table: ResultTable, title: str | None = None) -> Table:
     """A table for the terminal, with its caption; intervals stand below their values."""
+    # Imported here: a command that prints a few lines starts faster without.
+    import rich.box
+    from rich.table import Table
+    from rich.text import Text
+
     shown = Table(
         title=title or table.name,
         title_justify="left",
@@ -108,19 +145,33 @@ def result_table_rich(table: ResultTable, title: str | None = None) -> Table:
         pad_edge=False,
         padding=(0, 1, 0, 0),
     )
-    for column in table.columns:
-        heading = f"{column.group} {column.heading}".strip()
+    for k, column in enumerate(table.columns):
         shown.add_column(
-            heading, justify="left" if column.words else "right", no_wrap=not column.words, min_width=14 * column.words
+            _heading(column) if column.words else _narrow(_heading(column), [row[k].text for row in table.rows]),
+            justify="left" if column.words else "right",
+            no_wrap=not column.words,
+            min_width=14 * column.words,
+            overflow="fold",
         )
     for row in table.rows:
-        shown.add_row(*(Text(cell.text.replace(" [", "\n["), style="bold" if cell.best else "") for cell in row))
+        shown.add_row(*(Text(_below(cell.text), style="bold" if cell.best else "") for cell in row))
     return shown
+
+
+def _below(text: str) -> str:
+    """An interval below its value."""
+    return text.replace(" [", "\n[")
+
+
+def _narrow(heading: str, texts: Sequence[str]) -> str:
+    """A heading that makes no column wider than its numbers where it has a space to be broken at."""
+    width = max((len(line) for text in texts for line in _below(text).splitlines()), default=0)
+    return heading if len(heading) <= width else heading.replace(" ", "\n", 1)
 
 
 def table_markdown(table: ResultTable) -> str:
     """A table as Markdown; a column of a group is headed "group heading"."""
-    headings = [f"{column.group} {column.heading}".strip() for column in table.columns]
+    headings = [_heading(column) for column in table.columns]
     lines = [markdown_row(headings), markdown_row([":--" if column.words else "--:" for column in table.columns])]
     for row in table.rows:
         lines.append(markdown_row([f"**{cell.text}**" if cell.best else cell.text for cell in row]))
@@ -147,7 +198,7 @@ def table_csv(table: ResultTable) -> str:
     writer = csv.writer(text, lineterminator="\n")
     head: list[str] = []
     for column, is_estimate in zip(table.columns, estimates, strict=True):
-        name = f"{column.group} {column.heading}".strip()
+        name = _heading(column)
         head += [name, f"{name} low", f"{name} high"] if is_estimate else [name]
     writer.writerow(head)
     for row in table.rows:

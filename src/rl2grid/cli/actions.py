@@ -7,15 +7,13 @@ import csv
 import math
 import sys
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
-import rich.box
-from rich.console import Console
-from rich.table import Table
-
-from rl2grid.analysis.action_space import ActionRow, explain_action, list_actions, select_actions
+from rl2grid.analysis.action_space import ActionRow, ElementChange, explain_action, list_actions, select_actions
+from rl2grid.analysis.table import Cell, Column, ResultTable
+from rl2grid.cli.output import Output
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid, load_grid
 from rl2grid.mdp.actions import StepAction, full_catalogue
@@ -25,9 +23,8 @@ SHOWN = 50
 """Actions listed unless --all is given."""
 
 
-def add_parser(commands: Any) -> None:
-    """Add the subcommand to those of ``rl2grid``."""
-    parser = commands.add_parser("actions", help="list, explain and draw a grid's topology actions")
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of the command."""
     parser.add_argument("grid", help="for example bus14")
     parser.add_argument("--level", type=int, default=0, help="difficulty level (default 0)")
     parser.add_argument("--substation", type=int, default=None, help="only moves at this substation")
@@ -44,18 +41,18 @@ def add_parser(commands: Any) -> None:
     parser.set_defaults(run=_run)
 
 
-def _run(options: argparse.Namespace) -> int:
+def _run(options: argparse.Namespace, output: Output) -> int:
     grid = load_grid(options.grid)
     if options.draw is not None and options.explain is None:
         raise UsageError("--draw needs an action: say which one with --explain.")
     if options.figures is not None:
-        return _write_figures(grid, options.figures)
+        return _write_figures(grid, options.figures, output)
     if options.explain is not None:
-        return _explain(grid, options.level, options.explain, options.draw)
-    return _list(grid, options)
+        return _explain(grid, options.level, options.explain, options.draw, output)
+    return _list(grid, options, output)
 
 
-def _list(grid: Grid, options: argparse.Namespace) -> int:
+def _list(grid: Grid, options: argparse.Namespace, output: Output) -> int:
     chosen = select_actions(grid, options.level, substation=options.substation, line=options.line)
     if options.format == "csv":
         _write_csv(list_actions(grid, options.level, chosen))
@@ -63,24 +60,30 @@ def _list(grid: Grid, options: argparse.Namespace) -> int:
     rows = list_actions(grid, options.level, chosen if options.all else chosen[:SHOWN])
     size = f"{grid.level_sizes[options.level]:,} actions"
     counted = size if len(chosen) == grid.level_sizes[options.level] else f"{len(chosen):,} of {size}"
-    table = _table(f"Level {options.level} of {grid.id}: {counted}")
-    for name in ("action", "catalogue", "rank", "survival", "95% interval", "margin"):
-        table.add_column(name, justify="right", no_wrap=True)
-    table.add_column("what it does")
-    for row in rows:
-        table.add_row(
-            str(row.action),
-            str(row.catalogue),
-            "-" if row.rank is None else f"{row.rank:,}",
-            _percent(row.survival),
-            f"{_percent(row.survival_low)} to {_percent(row.survival_high)}" if row.trials else "-",
-            _signed(row.margin),
-            row.words,
-        )
-    _console().print(table)
+    numbers = ("action", "catalogue", "rank", "survival", "95% interval", "margin")
+    table = ResultTable(
+        "actions",
+        "",
+        (*map(Column, numbers), Column("what it does", words=True)),
+        tuple(tuple(map(Cell, _cells(row))) for row in rows),
+    )
+    records = [asdict(row) for row in rows]
+    output.table(table, records, title=f"Level {options.level} of {grid.id}: {counted}")
     if len(rows) < len(chosen):
-        print(f"{len(rows)} of {len(chosen):,} are shown; --all shows every one.")
+        output.remark(f"{len(rows)} of {len(chosen):,} are shown; --all shows every one.")
     return 0
+
+
+def _cells(row: ActionRow) -> tuple[str, ...]:
+    return (
+        str(row.action),
+        str(row.catalogue),
+        "-" if row.rank is None else f"{row.rank:,}",
+        _percent(row.survival),
+        f"{_percent(row.survival_low)} to {_percent(row.survival_high)}" if row.trials else "-",
+        _signed(row.margin),
+        row.words,
+    )
 
 
 def _write_csv(rows: Sequence[ActionRow]) -> None:
@@ -92,36 +95,34 @@ def _write_csv(rows: Sequence[ActionRow]) -> None:
         writer.writerow([f"{value:.6g}" if isinstance(value, float) else value for value in values])
 
 
-def _explain(grid: Grid, level: int, action: int, drawing: Path | None) -> int:
+def _explain(grid: Grid, level: int, action: int, drawing: Path | None, output: Output) -> int:
     (row,) = list_actions(grid, level, [action])
     chosen = full_catalogue(grid)[row.catalogue]
     explanation = explain_action(grid, chosen)
     if drawing is not None:
         drawing = _draw(grid, chosen, drawing)
-    print(f"Action {action} of level {level} of {grid.id}: {row.words}")
-    print()
+    output.results(grid=grid.id, level=level, action=row, explanation=explanation, drawing=drawing)
+    output.text(f"Action {action} of level {level} of {grid.id}: {row.words}")
+    output.text("")
     rank = "not ranked" if row.rank is None else f"rank {row.rank:,}"
-    print(f"In the ranking   {rank}; catalogue id {row.catalogue}")
+    output.text(f"In the ranking   {rank}; catalogue id {row.catalogue}")
     if row.trials:
         interval = f"95% interval {_percent(row.survival_low)} to {_percent(row.survival_high)}"
-        print(f"Survival         {_percent(row.survival)} of {row.trials:,} trials ({interval})")
-        print(f"Mean margin      {_signed(row.margin)}")
-    print(f"Cooldown         {explanation.cooldown}")
-    print(f"Taking it back   {explanation.reversal}")
+        output.text(f"Survival         {_percent(row.survival)} of {row.trials:,} trials ({interval})")
+        output.text(f"Mean margin      {_signed(row.margin)}")
+    output.text(f"Cooldown         {explanation.cooldown}")
+    output.text(f"Taking it back   {explanation.reversal}")
     if not explanation.changes:
         return 0
-    table = _table(None)
-    for name in ("element", "before", "after"):
-        table.add_column(name, no_wrap=True)
-    for change in explanation.changes:
-        moved = change.before != change.after
-        table.add_row(change.name, _place(change.before), _place(change.after), style="bold" if moved else None)
-    print()
-    print("In the reference topology, everything in service and on busbar 1:")
-    _console().print(table)
-    print(explanation.consequence)
+    columns = tuple(Column(name, words=True) for name in ("element", "before", "after"))
+    rows = tuple(_change_cells(each) for each in explanation.changes)
+    output.text("")
+    if not output.json:
+        title = "In the reference topology, everything in service and on busbar 1:"
+        output.table(ResultTable("changes", "", columns, rows), title=title)
+    output.text(explanation.consequence)
     if drawing is not None:
-        print(f"Drawn in {drawing}.")
+        output.remark(f"Drawn in {drawing}.")
     return 0
 
 
@@ -136,7 +137,7 @@ def _draw(grid: Grid, action: StepAction, path: Path) -> Path:
     return Path(written)
 
 
-def _write_figures(grid: Grid, folder: Path) -> int:
+def _write_figures(grid: Grid, folder: Path, output: Output) -> int:
     action_figures, figures = _figure_modules()
     drawn = {
         "shares": action_figures.draw_shares(grid),
@@ -144,9 +145,12 @@ def _write_figures(grid: Grid, folder: Path) -> int:
         "ranking": action_figures.draw_ranking(grid),
     }
     make_folder(folder)
+    written = []
     for name, figure in drawn.items():
         paths = figures.save_figure(figure, folder / f"{grid.id}-{name}")
-        print(f"Written: {', '.join(str(path) for path in paths)}")
+        output.remark(f"Written: {', '.join(str(path) for path in paths)}")
+        written += paths
+    output.results(figures=written)
     return 0
 
 
@@ -158,15 +162,9 @@ def _figure_modules() -> tuple[ModuleType, ModuleType]:
     return action_figures, figures
 
 
-def _table(title: str | None) -> Table:
-    return Table(
-        title=title,
-        title_justify="left",
-        title_style="bold",
-        box=rich.box.SIMPLE_HEAD,
-        pad_edge=False,
-        padding=(0, 2, 0, 0),
-    )
+def _change_cells(change: ElementChange) -> tuple[Cell, ...]:
+    moved = change.before != change.after
+    return tuple(Cell(text, best=moved) for text in (change.name, _place(change.before), _place(change.after)))
 
 
 def _place(busbar: int | None) -> str:
@@ -179,9 +177,3 @@ def _percent(share: float) -> str:
 
 def _signed(value: float) -> str:
     return "-" if math.isnan(value) else f"{value:+.3f}"
-
-
-def _console() -> Console:
-    console = Console()
-    # A table cut to the width of a pipe would lose columns.
-    return Console(width=console.width if console.is_terminal else 200)

@@ -5,10 +5,8 @@ from __future__ import annotations
 import argparse
 import shlex
 from pathlib import Path
-from typing import Any
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
-
+from rl2grid.cli.output import Output
 from rl2grid.errors import UsageError
 from rl2grid.records.collection import collect
 from rl2grid.scenarios.splits import SPLITS
@@ -17,9 +15,8 @@ THEMES = ("light", "dark")
 SPLIT_HELP = "which evaluations are taken; by default those on validation, and all of a study"
 
 
-def add_parser(commands: Any) -> None:
-    """Add the subcommand to those of ``rl2grid``."""
-    parser = commands.add_parser("analyse", help="tables and figures from evaluations and training runs")
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of the command."""
     parser.add_argument(
         "folders",
         nargs="+",
@@ -32,7 +29,9 @@ def add_parser(commands: Any) -> None:
     parser.set_defaults(run=_run)
 
 
-def _run(options: argparse.Namespace) -> int:
+def _run(options: argparse.Namespace, output: Output) -> int:
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn
+
     collection = collect(options.folders, options.split)
     results, runs = collection.evaluations, collection.runs
     try:
@@ -42,7 +41,7 @@ def _run(options: argparse.Namespace) -> int:
         raise UsageError(f"Figures need {error.name}: install it with `pip install rl2grid[analysis]`.") from None
     plan = section.plan_section(results, runs)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-    with Progress(*columns, transient=True) as bar:
+    with output.progress(*columns, transient=True) as bar:
         task = bar.add_task("Analysing", total=len(plan.tables) + len(plan.pictures))
         index = section.results_section(
             options.output,
@@ -54,8 +53,9 @@ def _run(options: argparse.Namespace) -> int:
             plan=plan,
         )
     for sentence in collection.missing:
-        print(sentence)
-    print(f"{len(plan.tables)} tables and {len(plan.pictures)} figures, listed in {index}.")
+        output.remark(sentence)
+    output.results(index=index, tables=len(plan.tables), figures=len(plan.pictures), missing=collection.missing)
+    output.remark(f"{len(plan.tables)} tables and {len(plan.pictures)} figures, listed in {index}.")
     return 0
 
 

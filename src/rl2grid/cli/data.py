@@ -10,7 +10,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.filesize import decimal
 from rich.progress import (
     BarColumn,
@@ -23,8 +22,9 @@ from rich.progress import (
     TimeRemainingColumn,
     TransferSpeedColumn,
 )
-from rich.table import Table
 
+from rl2grid.analysis.table import Cell, Column, ResultTable
+from rl2grid.cli.output import Output
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid, load_grid, system_ids
 from rl2grid.scenarios import generated, inventory, published
@@ -40,10 +40,8 @@ from rl2grid.scenarios.splits import HELD_OUT_SPLITS
 ALL_MONTHS = "0-11"
 
 
-def add_parser(commands: Any) -> None:
-    """Add the subcommand to those of ``rl2grid``."""
-    parser = commands.add_parser("data", help="list, make, import, export, check, clean and download scenarios")
-    parser.set_defaults(run=lambda options: _print_help(parser))
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the actions of the command."""
     actions = parser.add_subparsers(dest="action", metavar="action")
     _add_list(actions)
     _add_make(actions)
@@ -54,30 +52,27 @@ def add_parser(commands: Any) -> None:
     _add_download(actions)
 
 
-def _print_help(parser: argparse.ArgumentParser) -> int:
-    parser.print_help()
-    return 0
-
-
 def _add_list(actions: Any) -> None:
     parser = actions.add_parser("list", help="what there is, and how much space it takes")
     parser.add_argument("grid", nargs="?", default=None, help="only this grid")
     parser.set_defaults(run=_list)
 
 
-def _list(options: argparse.Namespace) -> int:
+def _list(options: argparse.Namespace, output: Output) -> int:
     grids = [load_grid(grid_id) for grid_id in (system_ids() if options.grid is None else (options.grid,))]
-    table = Table(title="Scenarios on this machine", title_justify="left")
-    for name in ("grid", "source", "what"):
-        table.add_column(name, no_wrap=name != "what")
-    table.add_column("size", justify="right", no_wrap=True)
-    table.add_column("where", overflow="fold")
+    found = []
     for grid in grids:
-        _remove_damaged(grid)
-        for stored in inventory.inventory(grid):
-            table.add_row(grid.id, stored.kind, stored.what, decimal(stored.size), str(stored.place))
-    _console().print(table)
-    print(f"Caches in {data_folder()} take {decimal(inventory.caches_size())}; `rl2grid data clean` removes them.")
+        _remove_damaged(grid, output)
+        found += [(grid.id, stored) for stored in inventory.inventory(grid)]
+    words = ("grid", "source", "what", "size", "where")
+    values = [(grid, each.kind, each.what, each.size, str(each.place)) for grid, each in found]
+    records = [dict(zip(words, each, strict=True)) for each in values]
+    rows = tuple(tuple(map(Cell, (grid, kind, what, decimal(size), where))) for grid, kind, what, size, where in values)
+    columns = tuple(Column(name, words=name != "size") for name in words)
+    output.table(ResultTable("scenarios", "", columns, rows), records, title="Scenarios on this machine")
+    size = inventory.caches_size()
+    output.results(data_folder=data_folder(), caches_size=size)
+    output.remark(f"Caches in {data_folder()} take {decimal(size)}; `rl2grid data clean` removes them.")
     return 0
 
 
@@ -96,16 +91,17 @@ def _add_make(actions: Any) -> None:
     parser.set_defaults(run=_make)
 
 
-def _make(options: argparse.Namespace) -> int:
+def _make(options: argparse.Namespace, output: Output) -> int:
     grid = load_grid(options.grid)
     workers = _workers(options.workers)
     months = _wanted_months(options)
-    with _progress(MofNCompleteColumn(), _Rate("/min", 60.0), TimeRemainingColumn()) as bar:
+    with _progress(output, MofNCompleteColumn(), _Rate("/min", 60.0), TimeRemainingColumn()) as bar:
         task = bar.add_task(f"Making months of {grid.id}", total=len(months))
         for done in make_packs(grid, months, workers):
             bar.update(task, completed=done)
-    print(f"{len(months)} months of {grid.id} are in {generated.pack_folder(grid)}.")
-    _compare_with_published(grid, [generated.month_name(*month) for month in months])
+    output.results(grid=grid.id, months=len(months), folder=generated.pack_folder(grid))
+    output.remark(f"{len(months)} months of {grid.id} are in {generated.pack_folder(grid)}.")
+    _compare_with_published(output, grid, [generated.month_name(*month) for month in months])
     return 0
 
 
@@ -150,11 +146,12 @@ def _add_import(actions: Any) -> None:
     parser.set_defaults(run=_import)
 
 
-def _import(options: argparse.Namespace) -> int:
+def _import(options: argparse.Namespace, output: Output) -> int:
     grid = load_grid(options.grid)
-    with _progress(DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn()) as bar:
+    with _progress(output, DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn()) as bar:
         scenario = import_folder(grid, options.folder, _reporting(bar, f"Reading {options.folder}"))
-    print(f"Imported {scenario.id}: {scenario.n_rows:,} rows from {scenario.start_datetime:%Y-%m-%d %H:%M}.")
+    output.results(scenario=scenario.id, rows=scenario.n_rows, start=str(scenario.start_datetime))
+    output.remark(f"Imported {scenario.id}: {scenario.n_rows:,} rows from {scenario.start_datetime:%Y-%m-%d %H:%M}.")
     return 0
 
 
@@ -166,12 +163,15 @@ def _add_export(actions: Any) -> None:
     parser.set_defaults(run=_export)
 
 
-def _export(options: argparse.Namespace) -> int:
+def _export(options: argparse.Namespace, output: Output) -> int:
     grid = load_grid(options.grid)
     scenario = load_scenario(grid.id, options.scenario)
-    with _progress(TaskProgressColumn(), _Rate(" values/s", 1.0), TimeRemainingColumn()) as bar:
+    with _progress(output, TaskProgressColumn(), _Rate(" values/s", 1.0), TimeRemainingColumn()) as bar:
         folder = export_scenario(grid, scenario, options.folder, _reporting(bar, f"Writing {options.folder}"))
-    print(f"Wrote {scenario.n_rows:,} rows of {scenario.id} to {folder} ({decimal(inventory.size_of(folder))}).")
+    output.results(scenario=scenario.id, rows=scenario.n_rows, folder=folder)
+    output.remark(
+        f"Wrote {scenario.n_rows:,} rows of {scenario.id} to {folder} ({decimal(inventory.size_of(folder))})."
+    )
     return 0
 
 
@@ -183,7 +183,7 @@ def _add_check(actions: Any) -> None:
     parser.set_defaults(run=_check)
 
 
-def _check(options: argparse.Namespace) -> int:
+def _check(options: argparse.Namespace, output: Output) -> int:
     grid = load_grid(options.grid)
     if options.years < 1:
         raise UsageError(f"--years {options.years} is not allowed: at least 1 is needed.")
@@ -191,18 +191,19 @@ def _check(options: argparse.Namespace) -> int:
         from rl2grid.analysis import scenario_check
     except ImportError as error:
         raise UsageError(f"The page needs {error.name}: install it with `pip install rl2grid[analysis]`.") from None
-    _remove_damaged(grid)
-    _compare_with_published(grid, published.held_out_months())
-    output = options.output or Path("reports") / f"scenarios-{grid.id}.html"
+    _remove_damaged(grid, output)
+    _compare_with_published(output, grid, published.held_out_months())
+    page = options.output or Path("reports") / f"scenarios-{grid.id}.html"
     wanted = scenario_check.wanted_scenarios(grid, options.years)
     samples = []
-    with _progress(MofNCompleteColumn(), TimeRemainingColumn()) as bar:
+    with _progress(output, MofNCompleteColumn(), TimeRemainingColumn()) as bar:
         for scenario_id in bar.track(wanted, description=f"Reading series of {grid.id}"):
             samples.append(scenario_check.measure(grid, load_scenario(grid.id, scenario_id)))
     comparison = scenario_check.compare(grid, samples)
-    scenario_check.write_page(comparison, output)
-    _console().print(scenario_check.rich_table(comparison))
-    print(f"Page written to {output}.")
+    scenario_check.write_page(comparison, page)
+    output.table(scenario_check.check_table(comparison), title=f"Series of {grid.id}")
+    output.results(page=page)
+    output.remark(f"Page written to {page}.")
     return 0
 
 
@@ -212,17 +213,20 @@ def _add_clean(actions: Any) -> None:
     parser.set_defaults(run=_clean)
 
 
-def _clean(options: argparse.Namespace) -> int:
-    size = decimal(inventory.caches_size())
+def _clean(options: argparse.Namespace, output: Output) -> int:
+    n_bytes = inventory.caches_size()
+    size = decimal(n_bytes)
     where = f"expanded copies and generated months in {data_folder()}"
     if not options.yes:
         if not sys.stdin.isatty():
             raise UsageError(f"The {where} ({size}) were left alone, since nobody can be asked: add --yes.")
         if input(f"Remove the {where} ({size})? They are made again when needed. [y/N] ").strip().lower() != "y":
-            print("Nothing was removed.")
+            output.text("Nothing was removed.")
+            output.results(removed=0)
             return 0
     inventory.remove_caches()
-    print(f"Removed the {where}: {size}.")
+    output.results(removed=n_bytes)
+    output.remark(f"Removed the {where}: {size}.")
     return 0
 
 
@@ -233,27 +237,29 @@ def _add_download(actions: Any) -> None:
     parser.set_defaults(run=_download)
 
 
-def _download(options: argparse.Namespace) -> int:
+def _download(options: argparse.Namespace, output: Output) -> int:
     grid = load_grid(options.grid)
     folder: Path = options.folder or full_data_folder()
     archive = find_archive(grid.grid2op_name)
-    with _progress(DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn()) as bar:
+    with _progress(output, DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn()) as bar:
         target = download_dataset(grid, folder, archive, _reporting(bar, f"Downloading {grid.grid2op_name}"))
-    print(f"Dataset of {grid.id} in {target}. To play it: export {VARIABLE}={folder}")
+    output.results(folder=target)
+    output.remark(f"Dataset of {grid.id} in {target}. To play it: export {VARIABLE}={folder}")
     return 0
 
 
-def _remove_damaged(grid: Grid) -> None:
+def _remove_damaged(grid: Grid, output: Output) -> None:
     for copy in remove_damaged(grid.id):
-        print(f"Removed {copy}, which was damaged; it is made again when needed.")
+        output.remark(f"Removed {copy}, which was damaged; it is made again when needed.")
 
 
-def _compare_with_published(grid: Grid, names: Sequence[str]) -> None:
+def _compare_with_published(output: Output, grid: Grid, names: Sequence[str]) -> None:
     comparison = published.compare_with_published(grid, names)
+    output.results(deviations=[str(deviation) for deviation in comparison.deviations])
     for deviation in comparison.deviations:
-        print(deviation)
+        output.text(str(deviation))
     if comparison.months and not comparison.deviations:
-        print(f"{comparison.months} held-out months of {grid.id} are as they were published.")
+        output.remark(f"{comparison.months} held-out months of {grid.id} are as they were published.")
 
 
 class _Rate(ProgressColumn):
@@ -277,9 +283,9 @@ def _reporting(bar: Progress, description: str) -> Report:
 
 
 @contextlib.contextmanager
-def _progress(*columns: ProgressColumn) -> Iterator[Progress]:
+def _progress(output: Output, *columns: ProgressColumn) -> Iterator[Progress]:
     shown: Sequence[ProgressColumn] = (TextColumn("{task.description}"), BarColumn(), *columns)
-    bar = Progress(*shown, console=Console(stderr=True))
+    bar = output.progress(*shown)
     bar.start()
     try:
         yield bar
@@ -288,9 +294,3 @@ def _progress(*columns: ProgressColumn) -> Iterator[Progress]:
         raise
     finally:
         bar.stop()
-
-
-def _console() -> Console:
-    console = Console()
-    # A table cut to the width of a pipe would lose columns.
-    return Console(width=console.width if console.is_terminal else 160)

@@ -3,34 +3,56 @@
 from __future__ import annotations
 
 import argparse
+import re
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
 from rl2grid.agents.agent import Agent
 from rl2grid.analysis.comparison_table import reference_table
-from rl2grid.analysis.summary_table import rich_table
-from rl2grid.analysis.table import result_table_rich
+from rl2grid.analysis.summary_table import summary_table
+from rl2grid.analysis.table import table_records
 from rl2grid.cli import keywords
+from rl2grid.cli.output import Output
 from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import make_agent
 from rl2grid.evaluation.flags import environment_flags, evaluate_command
+from rl2grid.evaluation.own_agents import is_own
 from rl2grid.evaluation.protocol import evaluate, first_months
 from rl2grid.records.collection import LAST_POLICY
 from rl2grid.records.evaluations import Evaluation
 from rl2grid.records.methods import group_methods
-from rl2grid.scenarios.splits import TEST
+from rl2grid.scenarios.splits import SPLITS, TEST
 
 
-def run(options: argparse.Namespace) -> int:
-    """Evaluate as the flags say.
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of the command."""
+    parser.add_argument(
+        "agents",
+        nargs="+",
+        metavar="agent",
+        help=f"{keywords.AGENT_HELP}; several are compared with the first on the same months",
+    )
+    parser.add_argument("task", help="for example bus14-T0")
+    parser.add_argument("--split", default="validation", choices=SPLITS, help="validation picks models; test is last")
+    parser.add_argument(
+        "--months", type=int, default=None, help="the first of the split, balanced over the seasons; by default all"
+    )
+    parser.add_argument("--seeds", type=int, default=1, help="episodes per scenario, with seeds 0, 1, ...")
+    keywords.add_flags(parser)
+    parser.add_argument(
+        "--workers",
+        type=int,
+        default=None,
+        help="processes; by default this one for few native episodes, or one per core",
+    )
+    parser.add_argument("--output", type=Path, default=None, help="folder of the results of one agent")
+    parser.set_defaults(run=_run)
 
-    Raises:
-        UsageError: the request cannot be met; nothing was written.
-    """
+
+def _run(options: argparse.Namespace, output: Output) -> int:
     task = find_task(options.task)
     agents: Sequence[str] = options.agents
     if len(set(agents)) < len(agents):
@@ -38,23 +60,25 @@ def run(options: argparse.Namespace) -> int:
     if options.output is not None and len(agents) > 1:
         raise UsageError("--output is the folder of one agent: leave it out, and each gets a folder of its own.")
     # Before anything is played: one that does not exist would be found after an hour of others.
-    names = [_name_of_last(agent, make_agent(agent, task)) for agent in agents]
-    results = [_evaluated(agent, name, task, options) for agent, name in zip(agents, names, strict=True)]
-    console = Console()
+    made = [make_agent(agent, task) for agent in agents]
+    results = [_evaluated(agent, one, task, options, output) for agent, one in zip(agents, made, strict=True)]
     summaries = [result.summary for result in results]
-    console.print(rich_table(summaries, title=f"{task.id}, {options.split} scenarios"))
+    records = [asdict(result.summary) | {"foresight": result.foresight, "folder": result.folder} for result in results]
+    output.table(summary_table(summaries), records, title=f"{task.id}, {options.split} scenarios")
     for result in results:
         if result.foresight:
-            print(
+            output.remark(
                 f"{result.summary.agent} stepped saved true worlds: with this foresight it is not ranked with others."
             )
     if len(results) > 1:
-        _compare(results, console)
+        _compare(results, output)
     if options.split == TEST:
-        print("These test months were looked at outside of a ledger, which counts looks: 'rl2grid leaderboard test'.")
+        output.remark(
+            "These test months were looked at outside of a ledger, which counts looks: 'rl2grid leaderboard test'."
+        )
     for result in results:
         assert result.folder is not None
-        print(f"{len(result.episodes)} episodes in {result.folder / 'episodes.csv'}.")
+        output.remark(f"{len(result.episodes)} episodes in {result.folder / 'episodes.csv'}.")
     return 0
 
 
@@ -64,7 +88,7 @@ def _name_of_last(agent: str, made: Agent) -> str | None:
     return f"{made.name} (last)" if path.is_file() and path.stem == LAST_POLICY else None
 
 
-def _evaluated(agent: str, name: str | None, task: Task, options: argparse.Namespace) -> Evaluation:
+def _evaluated(agent: str, made: Agent, task: Task, options: argparse.Namespace, output: Output) -> Evaluation:
     chosen = keywords.given(options)
     return evaluate(
         agent,
@@ -73,28 +97,28 @@ def _evaluated(agent: str, name: str | None, task: Task, options: argparse.Names
         scenarios=None if options.months is None else first_months(task, options.split, options.months),
         seeds=range(options.seeds),
         workers=options.workers,
-        output=options.output or _default_output(agent, options, task.id.removeprefix("rl2grid/"), chosen),
-        progress=True,
-        name=name,
+        output=options.output or _default_output(agent, made, options, task, chosen),
+        progress=output.talks,
+        name=_name_of_last(agent, made),
         command=evaluate_command(agent, task, options.split, options.seeds, options.months, chosen),
         **chosen,
     )
 
 
-def _compare(results: Sequence[Evaluation], console: Console) -> None:
+def _compare(results: Sequence[Evaluation], output: Output) -> None:
     try:
         (methods,) = group_methods(results).values()
     except UsageError as error:
-        print(f"Not compared: {error}")
+        output.remark(f"Not compared: {error}")
         return
-    if len(methods) < 2:
-        return
-    # A table cut to the width of a pipe would lose columns.
-    wide = console if console.is_terminal else Console(width=120)
-    wide.print(result_table_rich(reference_table(methods), title="Paired differences"))
+    if len(methods) > 1:
+        table = reference_table(methods)
+        output.table(table, table_records(table), title="Paired differences")
 
 
-def _default_output(agent: str, options: argparse.Namespace, task: str, chosen: Mapping[str, Any]) -> Path:
+def _default_output(
+    agent: str, made: Agent, options: argparse.Namespace, task: Task, chosen: Mapping[str, Any]
+) -> Path:
     """Inside the run for one of its policies; else by task and agent."""
     parts = [options.split]
     if "heuristic" in chosen:
@@ -106,6 +130,16 @@ def _default_output(agent: str, options: argparse.Namespace, task: str, chosen: 
     path = Path(agent)
     if path.is_dir():
         return path / "evaluation" / name
-    if path.is_file():
+    if path.is_file() and not is_own(agent):
         return path.parent / "evaluation" / f"{path.stem}-{name}"
-    return Path("runs") / f"{task}-{agent}" / "evaluation" / name
+    return Path("runs") / f"{task.id.removeprefix('rl2grid/')}-{_in_paths(agent, made)}" / "evaluation" / name
+
+
+def _in_paths(agent: str, made: Agent) -> str:
+    """What folders call an agent; one of a user's own gets another folder whenever its file has changed."""
+    if not is_own(agent):
+        return agent
+    name = re.sub(r"[^\w.+-]+", "-", made.name)
+    version = getattr(made, "identity", None)
+    source = version.get("source_hash", "") if isinstance(version, dict) else ""
+    return f"{name}-{source[:8]}" if source else name

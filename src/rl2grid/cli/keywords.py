@@ -13,6 +13,13 @@ NAMES: tuple[str, ...] = tuple(option.name for option in options_without(*GIVEN_
 """Keywords that are flags."""
 
 
+AGENT_HELP = (
+    "do-nothing, random, recovery, greedy, greedy-n1, milp, dc-opf, a run folder or checkpoint, or one of your own as "
+    "package.module:Agent or ./agent.py"
+)
+"""What is played; a test compares it with the agents that there are."""
+
+
 def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add a flag for each of :data:`NAMES`; those that are not given leave no trace."""
     group = parser.add_argument_group(

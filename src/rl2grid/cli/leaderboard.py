@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-from rl2grid.analysis.table import result_table_rich
+from rl2grid.cli.output import Output
 from rl2grid.envs.tasks import find_task
 from rl2grid.errors import UsageError
 from rl2grid.records.entries import PlayableEntry, read_entry, write_entry
@@ -29,20 +27,13 @@ DIFFERENT = 1
 """Exit status when an entry is not what its actions make."""
 
 
-def add_parser(commands: Any) -> None:
-    """Add the subcommand to those of ``rl2grid``."""
-    parser = commands.add_parser("leaderboard", help="entries that anyone can play again, and their ranking")
-    parser.set_defaults(run=lambda options: _print_help(parser))
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the actions of the command."""
     actions = parser.add_subparsers(dest="action", metavar="action")
     _add_entry(actions)
     _add_test(actions)
     _add_verify(actions)
     _add_table(actions)
-
-
-def _print_help(parser: argparse.ArgumentParser) -> int:
-    parser.print_help()
-    return 0
 
 
 def _add_entry(actions: Any) -> None:
@@ -86,101 +77,110 @@ def _add_table(actions: Any) -> None:
     parser.set_defaults(run=_table)
 
 
-def _entry(options: argparse.Namespace) -> int:
+def _entry(options: argparse.Namespace, output: Output) -> int:
     from rl2grid.ledger.making import find_evaluation, make_entry
     from rl2grid.records.evaluations import load_evaluation
 
     folder = find_evaluation(options.folder, options.split)
     if not options.output.parent.is_dir():
         raise UsageError(f"Folder {options.output.parent} of the output does not exist.")
-    with _playing("Playing", len(load_evaluation(folder).episodes)) as show:
+    with _playing(output, "Playing", len(load_evaluation(folder).episodes)) as show:
         entry = make_entry(folder, agent=options.agent, label=options.label, on_progress=show)
     write_entry(options.output, entry)
     decisions = sum(len(episode.actions) for episode in entry.episodes)
     size = options.output.stat().st_size
     episodes = len(entry.episodes)
-    print(f"{episodes} of {episodes} episodes played as in the evaluation, with {decisions:,} actions.")
-    print(f"Written: {options.output} ({size / 1000:,.0f} kB).")
+    output.results(entry=options.output, episodes=episodes, actions=decisions)
+    output.remark(f"{episodes} of {episodes} episodes played as in the evaluation, with {decisions:,} actions.")
+    output.remark(f"Written: {options.output} ({size / 1000:,.0f} kB).")
     return 0
 
 
-def _test(options: argparse.Namespace) -> int:
+def _test(options: argparse.Namespace, output: Output) -> int:
     from rl2grid.ledger.subjects import count_look, find_subject, play_test
 
     for subject in [find_subject(text, options.months) for text in options.subjects]:
         results = read_ledger(options.ledger)
         if subject.digest in results:
-            print(f"{subject.agent} on {subject.task.id} has had its test: see {options.ledger.name}.")
+            output.remark(f"{subject.agent} on {subject.task.id} has had its test: see {options.ledger.name}.")
             continue
-        print(count_look(subject, results), flush=True)
-        add_test(options.ledger, play_test(subject))
+        output.remark(count_look(subject, results))
+        add_test(options.ledger, play_test(subject, progress=output.talks))
+    output.results(ledger=options.ledger)
     return 0
 
 
-def _verify(options: argparse.Namespace) -> int:
+def _verify(options: argparse.Namespace, output: Output) -> int:
     if options.ledger is not None:
-        return _verify_tests(options.ledger, options.files, options.months)
-    return _verify_entries([Path(file) for file in _some(options.files)])
+        return _verify_tests(options.ledger, options.files, options.months, output)
+    return _verify_entries([Path(file) for file in _some(options.files)], output)
 
 
-def _verify_tests(ledger: Path, texts: Sequence[str], months: int | None) -> int:
+def _verify_tests(ledger: Path, texts: Sequence[str], months: int | None, output: Output) -> int:
     from rl2grid.ledger.subjects import find_subject
     from rl2grid.ledger.verification import verify_test
 
-    different = 0
+    found: dict[str, str | None] = {}
     for subject in [find_subject(text, months) for text in texts]:
         stored = read_ledger(ledger).get(subject.digest)
         if stored is None:
             raise UsageError(f"The ledger has no test of {str(subject.agent)!r} on {subject.task.id} to compare with.")
         difference = verify_test(stored, subject)
-        different += difference is not None
-        words = f"differs in {difference}" if difference else "the same, bit for bit"
-        print(f"{subject}: {words}.", flush=True)
-    return DIFFERENT if different else 0
+        found[str(subject)] = difference
+        output.text(f"{subject}: {f'differs in {difference}' if difference else 'the same, bit for bit'}.")
+    return _verified(found, output)
 
 
-def _verify_entries(paths: Sequence[Path]) -> int:
+def _verify_entries(paths: Sequence[Path], output: Output) -> int:
     from rl2grid.ledger.verification import check_entry, verify_entry
 
     entries = _read(paths)
     for path, entry in entries.items():
         check_entry(entry, str(path))
-    different = 0
+    found: dict[str, str | None] = {}
     for path, entry in entries.items():
-        with _playing(f"Playing {path.name}", len(entry.episodes)) as show:
-            difference = verify_entry(entry, show)
+        with _playing(output, f"Playing {path.name}", len(entry.episodes)) as show:
+            difference = found[str(path)] = verify_entry(entry, show)
         if difference:
-            different += 1
             print(f"rl2grid: {path} is not verified: {difference}.", file=sys.stderr)
         else:
             survival, episodes = entry.evaluation.summary.survival.value, len(entry.episodes)
-            print(
+            output.text(
                 f"{path} is verified: survival {survival:.3f} in {episodes} of {episodes} episodes, exactly as stored."
             )
-    return DIFFERENT if different else 0
+    return _verified(found, output)
 
 
-def _table(options: argparse.Namespace) -> int:
+def _verified(found: Mapping[str, str | None], output: Output) -> int:
+    """The exit status, by how each entry differs; None: not at all."""
+    output.results(differences=found)
+    return DIFFERENT if any(found.values()) else 0
+
+
+def _table(options: argparse.Namespace, output: Output) -> int:
     if options.ledger is not None:
         from rl2grid.analysis.ledger_table import ledger_table
 
         task = None if options.only is None else find_task(options.only).id
-        print(ledger_table(read_ledger(options.ledger), task, options.to))
+        tests = read_ledger(options.ledger)
+        output.text(ledger_table(tests, task, options.to))
+        output.results(tests=[asdict(test) for test in tests.values()])
         return 0
     from rl2grid.analysis.result_tables import entry_table
+    from rl2grid.analysis.table import table_records
 
     by_task: dict[str, dict[Path, Evaluation]] = {}
     for path, entry in _read(_some(options.files)).items():
         by_task.setdefault(entry.identity["task"], {})[path] = entry.evaluation
     for results in by_task.values():
         check_comparable(list(results.values()))
-    console = Console()
-    # A table cut to the width of a pipe would lose columns.
-    wide = console if console.is_terminal else Console(width=160)
-    for task, results in by_task.items():
-        methods = {str(path): Method((result,)) for path, result in results.items()}
-        wide.print(result_table_rich(entry_table(methods), title=task.removeprefix("rl2grid/")))
-    print("As stored: 'rl2grid leaderboard verify' plays the actions again.")
+    records: dict[str, list[dict[str, object]]] = {}
+    for task, evaluations in by_task.items():
+        table = entry_table({str(path): Method((result,)) for path, result in evaluations.items()})
+        output.table(table, title=task.removeprefix("rl2grid/"))
+        records[task] = table_records(table)
+    output.results(**{table.name: records})
+    output.remark("As stored: 'rl2grid leaderboard verify' plays the actions again.")
     return 0
 
 
@@ -200,9 +200,11 @@ def _read(paths: Sequence[Path]) -> dict[Path, PlayableEntry]:
 
 
 @contextmanager
-def _playing(words: str, episodes: int) -> Iterator[Callable[[float], None]]:
+def _playing(output: Output, words: str, episodes: int) -> Iterator[Callable[[float], None]]:
     """A progress bar, to be told how many episodes were played."""
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, transient=True) as bar:
+    with output.progress(*columns, transient=True) as bar:
         task = bar.add_task(words, total=episodes)
         yield lambda played: bar.update(task, completed=played)

@@ -1,7 +1,7 @@
 """The command ``rl2grid``.
 
-Each subcommand parses its flags, calls one function of the layer below and prints the result. What a
-user did wrong is said in one sentence, without a traceback, with exit status 2.
+Each subcommand has a module, which adds its flags to a parser, calls one function of the layer below and says the
+result. What a user did wrong is said in one sentence, without a traceback, with exit status 2.
 """
 
 from __future__ import annotations
@@ -9,20 +9,58 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from pathlib import Path
-from typing import NoReturn
+from importlib import import_module
+from typing import Any, NoReturn
 
 from rl2grid import __version__
-from rl2grid.cli import actions, analyse, data, keywords, leaderboard, report, study, watch
-from rl2grid.cli.train import INTERRUPTED, train
+from rl2grid.cli.output import Output
 from rl2grid.errors import UsageError
-from rl2grid.scenarios.splits import SPLITS
 
 REFUSED = 2
+INTERRUPTED = 130
+"""Exit status after an interrupt, as shells have it."""
+
+COMMANDS: dict[str, str] = {
+    "demo": "train PPO on bus14, evaluate it beside simple agents, write a report",
+    "tasks": "list the tasks (103 on the seven grids) and their sizes",
+    "train": "train an algorithm on a task",
+    "evaluate": "play agents on enumerated scenarios, one row per episode",
+    "rank": "rank a grid's topology actions by trying them",
+    "analyse": "tables and figures from evaluations and training runs",
+    "report": "one HTML page with all results, figures, episodes and commands",
+    "leaderboard": "entries that anyone can play again, and their ranking",
+    "actions": "list, explain and draw a grid's topology actions",
+    "data": "list, make, import, export, check, clean and download scenarios",
+    "watch": "play one episode and make it visible: a page, an animation",
+    "study": "run, follow and tune many trainings and evaluations from one file",
+    "completion": "print a script that lets a shell complete commands and flags",
+}
+"""What each command does; its flags and all else are in ``rl2grid.cli.<command>``, imported when it is chosen."""
 
 
-class _Parser(argparse.ArgumentParser):
-    """An argument parser that refuses with one sentence."""
+class Parser(argparse.ArgumentParser):
+    """An argument parser that refuses with one sentence, and that is completed when it is used.
+
+    Args:
+        command: the module :data:`COMMANDS` of which adds the flags; None: they are added by the caller.
+    """
+
+    def __init__(self, *args: Any, command: str | None = None, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._command = command
+
+    def complete(self) -> None:
+        """Add the flags of the command, if that has not been done."""
+        command, self._command = self._command, None
+        if command is not None:
+            import_module(f"rl2grid.cli.{command}").add_flags(self)
+            for parser in _leaves(self):
+                _add_output_flags(parser)
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """As its parent, with all flags."""
+        self.complete()
+        return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
         raise UsageError(f"{message[0].upper()}{message[1:]}; see {self.prog} --help.")
@@ -47,116 +85,54 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(command_line: list[str]) -> int:
     if command_line[:1] == ["train"]:
+        from rl2grid.cli.train import train
+
         return train(command_line[1:])
     parser = make_parser()
     options = parser.parse_args(command_line)
-    if options.command is None:
-        parser.print_help()
+    if not hasattr(options, "run"):
+        _chosen(parser, options).print_help()
         return 0
-    status: int = options.run(options)
+    output = Output(json=options.json, quiet=options.quiet)
+    status: int = options.run(options, output)
+    output.close()
     return status
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """The parser of all subcommands but ``train``, which parses its own flags."""
-    parser = _Parser(prog="rl2grid", description="A benchmark for reinforcement learning in power-grid operation.")
+    """The parser of all subcommands; ``train`` parses its own flags."""
+    parser = Parser(prog="rl2grid", description="A benchmark for reinforcement learning in power-grid operation.")
     parser.add_argument("--version", action="version", version=f"rl2grid {__version__}")
-    commands = parser.add_subparsers(dest="command", metavar="command", parser_class=_Parser)
-    _add_demo(commands)
-    _add_tasks(commands)
-    commands.add_parser("train", help="train an algorithm on a task", add_help=False)
-    _add_evaluate(commands)
-    _add_rank(commands)
-    analyse.add_parser(commands)
-    report.add_parser(commands)
-    leaderboard.add_parser(commands)
-    actions.add_parser(commands)
-    data.add_parser(commands)
-    watch.add_parser(commands)
-    study.add_parser(commands)
+    commands = parser.add_subparsers(dest="command", metavar="command", parser_class=Parser)
+    for name, words in COMMANDS.items():
+        own = name != "train"
+        commands.add_parser(name, help=words, description=_sentence(words), command=name if own else None, add_help=own)
     return parser
 
 
-def _add_demo(commands: argparse._SubParsersAction[_Parser]) -> None:
-    parser = commands.add_parser("demo", help="train PPO on bus14, evaluate it beside simple agents, write a report")
-    parser.add_argument("--output", type=Path, default=Path("reports/demo"), help="folder of the report")
-    parser.add_argument("--decisions", type=int, default=None, help="decisions to train for")
-    parser.set_defaults(run=_demo)
+def _sentence(words: str) -> str:
+    return f"{words[0].upper()}{words[1:]}."
 
 
-def _demo(options: argparse.Namespace) -> int:
-    from rl2grid.studies.demo import run_demo
-
-    run_demo(options.output, decisions=options.decisions)
-    return 0
-
-
-def _add_tasks(commands: argparse._SubParsersAction[_Parser]) -> None:
-    parser = commands.add_parser("tasks", help="list the tasks (103 on the seven grids) and their sizes")
-    parser.add_argument("--grid", default=None, help="only the tasks of this grid")
-    parser.set_defaults(run=_tasks)
+def subparsers(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
+    """The parsers of the subcommands of ``parser`` by name; empty for one that has none."""
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            return dict(action.choices)
+    return {}
 
 
-def _tasks(options: argparse.Namespace) -> int:
-    from rl2grid.cli.tasks import print_tasks
-
-    print_tasks(options.grid)
-    return 0
+def _leaves(parser: argparse.ArgumentParser) -> list[argparse.ArgumentParser]:
+    below = subparsers(parser)
+    return [leaf for each in below.values() for leaf in _leaves(each)] if below else [parser]
 
 
-def _add_evaluate(commands: argparse._SubParsersAction[_Parser]) -> None:
-    parser = commands.add_parser("evaluate", help="play agents on enumerated scenarios, one row per episode")
-    parser.add_argument(
-        "agents",
-        nargs="+",
-        metavar="agent",
-        help="do-nothing, random, recovery, greedy, greedy-n1, milp, dc-opf, or a run folder or checkpoint; several "
-        "are compared with the first on the same months",
-    )
-    parser.add_argument("task", help="for example bus14-T0")
-    parser.add_argument("--split", default="validation", choices=SPLITS, help="validation picks models; test is last")
-    parser.add_argument(
-        "--months", type=int, default=None, help="the first of the split, balanced over the seasons; by default all"
-    )
-    parser.add_argument("--seeds", type=int, default=1, help="episodes per scenario, with seeds 0, 1, ...")
-    keywords.add_flags(parser)
-    parser.add_argument(
-        "--workers",
-        type=int,
-        default=None,
-        help="processes; by default this one for few native episodes, or one per core",
-    )
-    parser.add_argument("--output", type=Path, default=None, help="folder of the results of one agent")
-    parser.set_defaults(run=_evaluate)
+def _chosen(parser: argparse.ArgumentParser, options: argparse.Namespace) -> argparse.ArgumentParser:
+    """The parser of the command that was named without one of its actions, else that of all."""
+    return parser if options.command is None else subparsers(parser)[options.command]
 
 
-def _evaluate(options: argparse.Namespace) -> int:
-    from rl2grid.cli.evaluate import run
-
-    return run(options)
-
-
-def _add_rank(commands: argparse._SubParsersAction[_Parser]) -> None:
-    parser = commands.add_parser("rank", help="rank a grid's topology actions by trying them")
-    parser.add_argument("grid", help="for example bus14")
-    parser.add_argument("--states", type=int, default=1000, help="operating points in which the actions are tried")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--sampling", default="exhaustive", help="exhaustive, or uniform as in the paper")
-    parser.add_argument("--threads", type=int, default=None, help="threads that try; by default one per core")
-    parser.add_argument("--output", type=Path, default=Path("rankings"), help="folder of the result")
-    parser.set_defaults(run=_rank)
-
-
-def _rank(options: argparse.Namespace) -> int:
-    from rl2grid.evaluation.ranking import run_ranking
-
-    path = run_ranking(
-        options.grid,
-        options.states,
-        options.seed,
-        options.sampling,
-        options.output,
-        num_threads=options.threads,
-    )
-    print(f"Ranking written to {path}.")
-    return 0
+def _add_output_flags(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("output")
+    group.add_argument("--json", action="store_true", help="print the results as JSON and nothing else")
+    group.add_argument("--quiet", action="store_true", help="print the results alone: no progress, no remarks")

@@ -6,11 +6,9 @@ import argparse
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
-
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from rl2grid.cli.analyse import SPLIT_HELP
+from rl2grid.cli.output import Output
 from rl2grid.envs.tasks import short_id
 from rl2grid.errors import UsageError
 from rl2grid.records.collection import Collection, collect
@@ -21,9 +19,8 @@ from rl2grid.scenarios.splits import SPLITS
 PAGE_FILE = "report.html"
 
 
-def add_parser(commands: Any) -> None:
-    """Add the subcommand to those of ``rl2grid``."""
-    parser = commands.add_parser("report", help="one HTML page with all results, figures, episodes and commands")
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of the command."""
     parser.add_argument(
         "folders",
         nargs="+",
@@ -36,7 +33,9 @@ def add_parser(commands: Any) -> None:
     parser.set_defaults(run=_run)
 
 
-def _run(options: argparse.Namespace) -> int:
+def _run(options: argparse.Namespace, output: Output) -> int:
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn
+
     collection = collect(options.folders, options.split)
     try:
         from rl2grid.analysis import section
@@ -48,7 +47,8 @@ def _run(options: argparse.Namespace) -> int:
     train_commands = _train_commands(collection.runs)
     make_folder(options.output)
     path = options.output / PAGE_FILE
-    with Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), transient=True) as bar:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+    with output.progress(*columns, transient=True) as bar:
         task = bar.add_task("Drawing", total=number)
         size = write_report(
             path,
@@ -60,9 +60,11 @@ def _run(options: argparse.Namespace) -> int:
             plan=plan,
         )
     for sentence in collection.missing:
-        print(sentence)
-    print(f"{number} figures, {sum(len(result.episodes) for result in collection.evaluations):,} episodes.")
-    print(f"Written: {path} ({size / 1e6:.1f} MB).")
+        output.remark(sentence)
+    episodes = sum(len(result.episodes) for result in collection.evaluations)
+    output.results(page=path, figures=number, episodes=episodes, missing=collection.missing)
+    output.remark(f"{number} figures, {episodes:,} episodes.")
+    output.remark(f"Written: {path} ({size / 1e6:.1f} MB).")
     return 0
 
 

@@ -3,37 +3,32 @@
 from __future__ import annotations
 
 import argparse
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-from rich.table import Table
-
-from rl2grid.cli.train import INTERRUPTED
+from rl2grid.analysis.table import Cell, Column, ResultTable
+from rl2grid.cli.main import INTERRUPTED
+from rl2grid.cli.output import Output
 from rl2grid.errors import UsageError
 from rl2grid.records.logs import LOG_FILE
 
 if TYPE_CHECKING:
     from rl2grid.studies.cells import Study
+    from rl2grid.studies.states import CellState
 
 FAILED = 1
 """Exit status when cells were given up."""
 
 
-def add_parser(commands: Any) -> None:
-    """Add the subcommand to those of ``rl2grid``."""
-    parser = commands.add_parser("study", help="run, follow and tune many trainings and evaluations from one file")
-    parser.set_defaults(run=lambda options: _print_help(parser))
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the actions of the command."""
     actions = parser.add_subparsers(dest="action", metavar="action")
     _add_run(actions)
     _add_status(actions)
     _add_list(actions)
     _add_tune(actions)
-
-
-def _print_help(parser: argparse.ArgumentParser) -> int:
-    parser.print_help()
-    return 0
 
 
 def _add_run(actions: Any) -> None:
@@ -69,71 +64,97 @@ def _add_tune(actions: Any) -> None:
     parser.set_defaults(run=_tune)
 
 
-def _run(options: argparse.Namespace) -> int:
+def _run(options: argparse.Namespace, output: Output) -> int:
     study = _load(options)
+    from rich.console import Console
+
     from rl2grid.studies.backends import make_backend
-    from rl2grid.studies.progress import results_table, study_table
     from rl2grid.studies.run import run_study
     from rl2grid.studies.states import State
 
-    console = Console()
+    console = Console(stderr=True)
     backend = make_backend(options.backend, study.output / "jobs", options.jobs, study.slurm)
     try:
-        states = run_study(study, backend, console)
+        states = run_study(study, backend, console if output.talks else None)
     except KeyboardInterrupt:
         console.print("Study stopped. The same command goes on.")
         return INTERRUPTED
-    if not console.is_terminal:
-        console.print(study_table(study, states, None))
-    console.print(results_table(states))
-    print(f"All episodes are in {study.output / 'episodes.csv'}.")
+    _show(study, states, output)
+    episodes = study.output / "episodes.csv"
+    output.results(episodes=episodes)
+    output.remark(f"All episodes are in {episodes}.")
     failed = [state for state in states if state.state == State.FAILED]
     if failed:
-        print(f"{len(failed)} cells failed; their {LOG_FILE} says why. The same command tries them again.")
+        output.text(f"{len(failed)} cells failed; their {LOG_FILE} says why. The same command tries them again.")
     return FAILED if failed else 0
 
 
-def _status(options: argparse.Namespace) -> int:
+def _status(options: argparse.Namespace, output: Output) -> int:
     study = _load(options)
-    from rl2grid.studies.progress import results_table, study_table
     from rl2grid.studies.states import read_states
 
-    console, states = Console(), read_states(study)
-    console.print(study_table(study, states, None))
-    if any(state.result for state in states):
-        console.print(results_table(states))
+    _show(study, read_states(study), output)
     return 0
 
 
-def _list(options: argparse.Namespace) -> int:
+def _show(study: Study, states: Sequence[CellState], output: Output) -> None:
+    """How far the cells are, why some failed, and what the finished ones reached."""
+    from rl2grid.studies.progress import cells_table, failures, headline, results_table
+
+    output.results(study=study.name, scale=study.scale, cells=[_record(state) for state in states])
+    if output.json:
+        return
+    output.text(headline(study, states, None))
+    for table in (cells_table(states), results_table(states)):
+        if table.rows:
+            output.table(table)
+    for sentence in failures(states):
+        output.text(sentence)
+
+
+def _record(state: CellState) -> dict[str, Any]:
+    record = {"cell": state.cell.name, "state": state.state, "share": state.share, "error": state.error or None}
+    return record if state.result is None else record | vars(state.result)
+
+
+def _list(options: argparse.Namespace, output: Output) -> int:
     _check_installed()
     from rl2grid.studies.study import included_studies, parse_study
     from rl2grid.studies.toml_file import read_toml
 
-    table = Table(box=None, pad_edge=False)
-    for column in ("study", "scale", "cells", "decisions"):
-        table.add_column(column, no_wrap=True, justify="left" if column in ("study", "scale") else "right")
+    records = []
     for name, path in included_studies().items():
         contents = read_toml(path)
         for scale in contents.get("scale", {None: {}}):
             cells = parse_study(contents, scale).cells
-            table.add_row(name, scale or "", str(len(cells)), f"{sum(cell.decisions for cell in cells):,}")
-    Console().print(table)
+            decisions = sum(cell.decisions for cell in cells)
+            records.append({"study": name, "scale": scale, "cells": len(cells), "decisions": decisions})
+    columns = (Column("study", words=True), Column("scale", words=True), Column("cells"), Column("decisions"))
+    rows = tuple(
+        tuple(map(Cell, (each["study"], each["scale"] or "", str(each["cells"]), f"{each['decisions']:,}")))
+        for each in records
+    )
+    output.table(ResultTable("studies", "", columns, rows), records)
     return 0
 
 
-def _tune(options: argparse.Namespace) -> int:
+def _tune(options: argparse.Namespace, output: Output) -> int:
     _check_installed()
+    from rich.console import Console
+
     from rl2grid.studies.search import best_command, run_tuning
     from rl2grid.studies.tuning import load_tuning
 
     tuning = load_tuning(options.file, options.output)
-    best = run_tuning(tuning, options.jobs, Console())
+    best = run_tuning(tuning, options.jobs, Console(stderr=True) if output.talks else None)
     if best is None:
-        print("Search stopped. The same command goes on.")
+        print("Search stopped. The same command goes on.", file=sys.stderr)
         return INTERRUPTED
-    print(f"Best validation survival: {best.survival:.3f} (trial {best.trial}), in {tuning.output / 'best.json'}.")
-    print(best_command(tuning, best))
+    output.results(best=best, command=best_command(tuning, best), file=tuning.output / "best.json")
+    output.text(
+        f"Best validation survival: {best.survival:.3f} (trial {best.trial}), in {tuning.output / 'best.json'}."
+    )
+    output.text(best_command(tuning, best))
     return 0
 
 

@@ -1,46 +1,66 @@
-"""Tables that the command line prints."""
+"""``rl2grid tasks``: the tasks and their sizes."""
 
 from __future__ import annotations
 
-from rich.console import Console
-from rich.table import Table
+import argparse
+from typing import Any
 
+from rl2grid.analysis.table import Cell, Column, ResultTable
+from rl2grid.cli.output import Output
 from rl2grid.envs.tasks import Task, all_tasks, tasks_of
 from rl2grid.grids import find_system
 from rl2grid.mdp.features import observation_size
 
-
-def print_tasks(grid_id: str | None) -> None:
-    """All tasks, or those of one grid, with their sizes.
-
-    Raises:
-        UsageError: there is no such grid.
-    """
-    chosen = tuple(all_tasks().values()) if grid_id is None else tasks_of(find_system(grid_id))
-    table = Table(title=f"{len(chosen)} tasks", title_justify="left")
-    table.add_column("id", no_wrap=True)
-    for name in ("subs", "lines", "gens", "loads", "storages", "observation", "actions"):
-        table.add_column(name, justify="right")
-    table.add_column("contingencies")
-    table.add_column("constraint")
-    for task in chosen:
-        grid = task.grid
-        sizes = (grid.n_sub, grid.n_line, grid.n_gen, grid.n_load, grid.n_storage)
-        table.add_row(
-            task.id,
-            *(str(size) for size in sizes),
-            str(observation_size(grid, task.kind)),
-            f"{task.n_actions:,} discrete" if task.kind == "T" else f"{task.n_actions} continuous",
-            _contingencies(task),
-            task.constraint or "",
-        )
-    # A table cut to the width of a pipe would lose columns.
-    console = Console()
-    Console(width=console.width if console.is_terminal else 160).print(table)
+_COLUMNS = (
+    Column("id", words=True),
+    *map(Column, ("subs", "lines", "gens", "loads", "storages", "observation", "actions")),
+    Column("contingencies", words=True),
+    Column("constraint", words=True),
+)
 
 
-def _contingencies(task: Task) -> str:
-    parts = ["maintenance"]
-    if task.grid.opponent.kind != "none":
-        parts.append(f"{task.grid.opponent.kind.replace('_', '-')} opponent")
-    return ", ".join(parts)
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of the command."""
+    parser.add_argument("--grid", default=None, help="only the tasks of this grid")
+    parser.set_defaults(run=_run)
+
+
+def _run(options: argparse.Namespace, output: Output) -> int:
+    chosen = tuple(all_tasks().values()) if options.grid is None else tasks_of(find_system(options.grid))
+    records = [_record(task) for task in chosen]
+    rows = tuple(
+        tuple(Cell(text) for text in _cells(task, record)) for task, record in zip(chosen, records, strict=True)
+    )
+    output.table(ResultTable("tasks", "", _COLUMNS, rows), records, title=f"{len(chosen)} tasks")
+    return 0
+
+
+def _record(task: Task) -> dict[str, Any]:
+    grid = task.grid
+    return {
+        "id": task.id,
+        "grid": grid.id,
+        "kind": task.kind,
+        "level": task.level if task.kind == "T" else None,
+        "substations": grid.n_sub,
+        "lines": grid.n_line,
+        "generators": grid.n_gen,
+        "loads": grid.n_load,
+        "storages": grid.n_storage,
+        "observation": observation_size(grid, task.kind),
+        "actions": task.n_actions,
+        "opponent": None if grid.opponent.kind == "none" else grid.opponent.kind,
+        "constraint": task.constraint,
+    }
+
+
+def _cells(task: Task, record: dict[str, Any]) -> tuple[str, ...]:
+    sizes = ("substations", "lines", "generators", "loads", "storages", "observation")
+    opponent = record["opponent"]
+    return (
+        task.id,
+        *(str(record[name]) for name in sizes),
+        f"{task.n_actions:,} discrete" if task.kind == "T" else f"{task.n_actions} continuous",
+        "maintenance" if opponent is None else f"maintenance, {opponent.replace('_', '-')} opponent",
+        task.constraint or "",
+    )

@@ -12,9 +12,12 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 from rl2grid.algorithms.registry import algorithm_names
 from rl2grid.cli.keywords import flag_text, reward_of
+from rl2grid.cli.main import INTERRUPTED
+from rl2grid.cli.output import Output
 from rl2grid.envs.options import TaskOptions, options_of, options_without
 from rl2grid.envs.tasks import Task, find_task, short_id
 from rl2grid.errors import UsageError
+from rl2grid.evaluation.flags import flag_of
 from rl2grid.scenarios.splits import VALIDATION_MONTHS
 from rl2grid.training.limits import TimeLimit
 
@@ -23,12 +26,10 @@ if TYPE_CHECKING:
 
 GIVEN_OTHERWISE = ("split", "gamma")
 """Keywords that a training decides itself."""
-INTERRUPTED = 130
-"""Exit status after an interrupt, as shells have it."""
 
 _HELP = f"""\
 usage: rl2grid train <algorithm> <task> [flags]
-       rl2grid train --resume <run folder> [--max-minutes <minutes>]
+       rl2grid train --resume <run folder> [--max-minutes <minutes>] [--quiet] [--json]
 
 Trains an algorithm ({", ".join(algorithm_names())}) on a task (see `rl2grid tasks`) and writes a run folder:
 configuration, metrics.csv, tensorboard/, checkpoint.pt, best.pt by validation, log.txt. A run that was
@@ -43,11 +44,11 @@ class TrainFlags:
 
     preset: str = "default"
     """Hyperparameters to start from: ``default`` or ``paper``; single flags replace single values."""
-    folder: Path | None = None
+    output: Path | None = None
     """Run folder, which must not exist yet; None: runs/<task>-<algorithm>-<seed>."""
-    num_threads: int | None = None
+    threads: int | None = None
     """Native engine: threads that play the environments; None: one per processor core. No influence on results."""
-    num_workers: int | None = None
+    workers: int | None = None
     """Reference engine: processes that play them; None: one per processor core. No influence on results."""
     evaluate_every: int = 50_000
     """Decisions between two evaluations on the validation scenarios."""
@@ -61,6 +62,10 @@ class TrainFlags:
     """Whether Weights & Biases gets the metrics; not before `wandb sync` with WANDB_MODE=offline."""
     wandb_project: str = "rl2grid"
     """The project that gets them."""
+    json: bool = False
+    """Whether to print the results as JSON and nothing else."""
+    quiet: bool = False
+    """Whether to print the results alone: no progress, no remarks."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +74,10 @@ class ResumeFlags:
 
     max_minutes: float | None = None
     """Minutes after which the run stops again with a checkpoint; None: no limit."""
+    json: bool = False
+    """Whether to print the results as JSON and nothing else."""
+    quiet: bool = False
+    """Whether to print the results alone: no progress, no remarks."""
 
 
 def train(command_line: list[str]) -> int:
@@ -99,8 +108,9 @@ def _resume(arguments: list[str]) -> int:
     own = _parse("rl2grid train --resume", flags, ResumeFlags())
     limit = TimeLimit(own.max_minutes)
     args, _ = request.read_config(path)
-    folder = runs.resume(path, evaluate=find_validator(args), limit=limit)
-    return _report(folder, args.task, limit)
+    output = Output(json=own.json, quiet=own.quiet)
+    folder = runs.resume(path, evaluate=find_validator(args), limit=limit, progress=output.talks)
+    return _report(folder, args.task, limit, output)
 
 
 def _begin(algorithm: str, task_id: str, flags: list[str]) -> int:
@@ -113,21 +123,22 @@ def _begin(algorithm: str, task_id: str, flags: list[str]) -> int:
     hyperparameters = request.hyperparameters(algorithm, task, _preset(flags))
     _refuse_unknown(flags, [*fields(TrainFlags), *options_without(*GIVEN_OTHERWISE), *fields(hyperparameters)])
     own, keywords, hyperparameters = _parse_all(f"rl2grid train {algorithm} {task.id}", flags, hyperparameters)
-    limit = TimeLimit(own.max_minutes)
+    limit, output = TimeLimit(own.max_minutes), Output(json=own.json, quiet=own.quiet)
     keywords["reward"] = reward_of(keywords["reward"])
     options_of(task, keywords)
     args = request.RunArgs(
         task=task,
         hyperparameters=hyperparameters,
         algorithm=algorithm,
-        folder=own.folder,
+        folder=own.output,
         env_keywords=keywords,
-        num_threads=own.num_threads,
-        num_workers=own.num_workers,
+        num_threads=own.threads,
+        num_workers=own.workers,
         checkpoint_seconds=own.checkpoint_seconds,
         evaluate_every=own.evaluate_every,
         validation_months=own.validation_months,
         wandb_project=own.wandb_project if own.track else None,
+        progress=output.talks,
     )
     try:
         folder = runs.train(args, evaluate=find_validator(args), limit=limit)
@@ -137,24 +148,26 @@ def _begin(algorithm: str, task_id: str, flags: list[str]) -> int:
             raise  # the same command begins it
         print(f"rl2grid: interrupted; go on with `rl2grid train --resume {folder}`.", file=sys.stderr)
         return INTERRUPTED
-    return _report(folder, task, limit)
+    return _report(folder, task, limit, output)
 
 
-def _report(folder: Path, task: Task, limit: TimeLimit) -> int:
+def _report(folder: Path, task: Task, limit: TimeLimit, output: Output) -> int:
     from rl2grid.training import runs
     from rl2grid.training.energy import energy_line
 
     used = energy_line(folder)
     if used:
-        print(f"Energy of the run so far: {used}, see {folder / 'energy.json'}.")
+        output.remark(f"Energy of the run so far: {used}, see {folder / 'energy.json'}.")
     finished = runs.is_finished(folder)
+    output.results(run=folder, finished=finished)
+    output.close()
     if not finished and limit.reached:
-        print(f"Run stopped by --max-minutes: {folder}. Go on with `rl2grid train --resume {folder}`.")
+        output.text(f"Run stopped by --max-minutes: {folder}. Go on with `rl2grid train --resume {folder}`.")
         return 0
     if not finished:
-        print(f"Run stopped: {folder}. Go on with `rl2grid train --resume {folder}`.")
+        output.text(f"Run stopped: {folder}. Go on with `rl2grid train --resume {folder}`.")
         return INTERRUPTED
-    print(f"Run complete: {folder}. Evaluate it with `rl2grid evaluate {folder} {short_id(task.id)}`.")
+    output.text(f"Run complete: {folder}. Evaluate it with `rl2grid evaluate {folder} {short_id(task.id)}`.")
     return 0
 
 
@@ -173,17 +186,36 @@ def _parse_all(
     """The flags of the run, the environment's keywords and the algorithm's flags, of one list."""
     import tyro
 
-    environment = _environment_flags()
+    environment, learning = _environment_flags(), _hyperparameter_flags(type(hyperparameters))
     request = make_dataclass(
         "Request",
         [
             ("flags", tyro.conf.OmitArgPrefixes[TrainFlags]),
             ("environment", tyro.conf.OmitArgPrefixes[environment]),  # type: ignore[misc, valid-type]
-            ("hyperparameters", tyro.conf.OmitArgPrefixes[type(hyperparameters)]),  # type: ignore[misc]
+            ("hyperparameters", tyro.conf.OmitArgPrefixes[learning]),  # type: ignore[misc, valid-type]
         ],
     )
-    parsed = _parse(program, flags, request(TrainFlags(), environment(), hyperparameters))
-    return parsed.flags, asdict(parsed.environment), parsed.hyperparameters
+    chosen = {each.name: getattr(hyperparameters, each.name) for each in fields(hyperparameters)}
+    parsed = _parse(program, flags, request(TrainFlags(), environment(), learning(**chosen)))
+    chosen = {name: getattr(parsed.hyperparameters, name) for name in chosen}
+    return parsed.flags, asdict(parsed.environment), type(hyperparameters)(**chosen)
+
+
+def _hyperparameter_flags(of: type[Any]) -> type[Any]:
+    """A dataclass like ``of``, whose fields are called as flags call them."""
+    import tyro
+
+    hints = get_type_hints(of)
+    renamed = {each.name: each.default for each in fields(of) if flag_of(each.name) != each.name.replace("_", "-")}
+    return make_dataclass(
+        of.__name__,
+        [
+            (name, Annotated[hints[name], tyro.conf.arg(name=flag_of(name))], field(default=default))
+            for name, default in renamed.items()
+        ],
+        bases=(of,),
+        frozen=True,
+    )
 
 
 def _environment_flags() -> type[Any]:
@@ -232,8 +264,8 @@ def _sentence(box: str) -> str:
 
 
 def _refuse_unknown(flags: list[str], known: list[Field[Any]]) -> None:
-    names = {"--help", *(f"--{field.name.replace('_', '-')}" for field in known)}
-    names |= {f"--no-{field.name.replace('_', '-')}" for field in known if field.type == "bool"}
+    names = {"--help", *(f"--{flag_of(field.name)}" for field in known)}
+    names |= {f"--no-{flag_of(field.name)}" for field in known if field.type == "bool"}
     for flag in flags:
         name = flag.split("=", 1)[0].replace("_", "-")
         if not flag.startswith("--") or name in names:

@@ -7,28 +7,28 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-from rl2grid.cli.train import INTERRUPTED
+from rl2grid.cli.keywords import AGENT_HELP
+from rl2grid.cli.main import INTERRUPTED
+from rl2grid.cli.output import Output
 from rl2grid.engines import HEURISTICS
 from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
 from rl2grid.records.files import make_folder
 from rl2grid.scenarios.splits import SPLITS
 
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
 FRAMES = 300
 """Frames of an animation unless --every is given: 25 seconds."""
 FORMATS = ("html", "gif", "mp4")
 
 
-def add_parser(commands: Any) -> None:
-    """Add the subcommand to those of ``rl2grid``."""
-    parser = commands.add_parser("watch", help="play one episode and make it visible: a page, an animation")
-    parser.add_argument(
-        "agent", help="do-nothing, random, recovery, greedy, greedy-n1, milp, dc-opf, or a run folder or checkpoint"
-    )
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of the command."""
+    parser.add_argument("agent", help=AGENT_HELP)
     parser.add_argument("task", help="for example bus14-T0")
     parser.add_argument("--split", default="validation", choices=SPLITS)
     parser.add_argument("--scenario", default=None, help="by default the first of the split")
@@ -43,7 +43,7 @@ def add_parser(commands: Any) -> None:
     parser.set_defaults(run=_run)
 
 
-def _run(options: argparse.Namespace) -> int:
+def _run(options: argparse.Namespace, output: Output) -> int:
     task = find_task(options.task)
     if options.every is not None and options.every < 1:
         raise UsageError(f"every={options.every} is not allowed: give a number of grid steps, at least 1.")
@@ -52,7 +52,7 @@ def _run(options: argparse.Namespace) -> int:
         animation.check_encoder(suffix)
     make_folder(options.output)
     try:
-        with _progress() as progress:
+        with _progress(output) as progress:
             recording = _play(task, options, progress)
             name = f"{task.id.removeprefix('rl2grid/')}-{recording.agent}-{recording.scenario.replace('/', '-')}"
             path = options.output / f"{name}-{options.seed}"
@@ -69,9 +69,17 @@ def _run(options: argparse.Namespace) -> int:
         return INTERRUPTED
     acted = sum(bool(words) for words in recording.actions)
     ending = f"game over: {recording.game_over}" if recording.game_over else "alive at the end"
-    print(f"{recording.n_steps:,} of {recording.episode_length:,} steps, {acted:,} actions; {ending}.")
-    for suffix in options.format:
-        print(f"Written: {path}.{suffix}")
+    output.text(f"{recording.n_steps:,} of {recording.episode_length:,} steps, {acted:,} actions; {ending}.")
+    files = [f"{path}.{suffix}" for suffix in options.format]
+    for file in files:
+        output.remark(f"Written: {file}")
+    output.results(
+        steps=recording.n_steps,
+        episode_length=recording.episode_length,
+        actions=acted,
+        game_over=recording.game_over or None,
+        files=files,
+    )
     return 0
 
 
@@ -102,8 +110,10 @@ def _frame_steps(n_rows: int, every: int | None) -> Sequence[int]:
     return steps if steps[-1] == n_rows - 1 else [*steps, n_rows - 1]
 
 
-def _progress() -> Progress:
-    return Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+def _progress(output: Output) -> Progress:
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+
+    return output.progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
 
 
 def _drawing_modules() -> tuple[ModuleType, ModuleType]:

@@ -10,12 +10,20 @@ from typing import Any
 from rl2grid.envs.options import TaskOptions
 from rl2grid.envs.tasks import Task, short_id
 
+_FLAGS = {"total_timesteps": "decisions"}
+"""Hyperparameters that have the name of CleanRL, and the word that every command has for the same thing."""
+
+
+def flag_of(name: str) -> str:
+    """The flag that sets a hyperparameter, keyword or other value of that name, without its dashes."""
+    return _FLAGS.get(name, name).replace("_", "-")
+
 
 def flags(values: Mapping[str, Any]) -> list[str]:
     """Flags that set values, by name."""
     words = []
     for name, value in values.items():
-        flag = name.replace("_", "-")
+        flag = flag_of(name)
         if isinstance(value, bool):
             words.append(f"--{flag}" if value else f"--no-{flag}")
             continue
@@ -38,7 +46,7 @@ def evaluate_command(
     """The ``rl2grid evaluate`` that plays an agent like that.
 
     Args:
-        agent: name, run folder or checkpoint.
+        agent: name, run folder, checkpoint, or where an agent of one's own is written.
         task: the task.
         split: whose months.
         seeds: episodes per month.

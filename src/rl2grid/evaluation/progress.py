@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
 import rich.progress
+from rich.console import Console
 
 from rl2grid.evaluation.crew import Job, Progress, Setting
 from rl2grid.records.episodes import Episode
@@ -76,7 +77,7 @@ def show_progress(setting: Setting, jobs: Sequence[Job], progress: bool) -> Iter
         rich.progress.TextColumn("{task.fields[rate]}"),
         rich.progress.TimeRemainingColumn(),
     )
-    with rich.progress.Progress(*columns) as bar:
+    with rich.progress.Progress(*columns, console=Console(stderr=True)) as bar:
         yield ProgressBar(bar, setting, len(jobs))
 
 
@@ -94,7 +95,8 @@ def watch_making(grid_id: str, made: Iterator[int], total: int, progress: bool) 
         for _ in made:
             pass
         return
-    with rich.progress.Progress(*rich.progress.Progress.get_default_columns()) as bar:
+    columns = rich.progress.Progress.get_default_columns()
+    with rich.progress.Progress(*columns, console=Console(stderr=True)) as bar:
         task = bar.add_task(f"Making months of {grid_id}", total=total, completed=there)
         for there in made:
             bar.update(task, completed=there)

@@ -64,7 +64,8 @@ def evaluate(
 
     Args:
         agent: ``"do-nothing"``, ``"random"``, ``"recovery"``, ``"greedy"``, ``"milp"``, ``"dc-opf"``, the path of a
-            checkpoint or run folder, or an agent that is not bound to an environment yet.
+            checkpoint or run folder, ``"package.module:Agent"``, ``"./agent.py"``, or an agent that is not bound to an
+            environment yet.
         task: the task, or its id, whose namespace and version may be left out.
         split: whose scenarios are played: ``"validation"``, ``"test"``, ``"train"`` or ``"bundled"``.
         scenarios: play these only; None: all of the split.
@@ -88,8 +89,8 @@ def evaluate(
     chosen = make_agent(agent, task) if isinstance(agent, str | Path) else agent
     keywords = env_keywords(chosen, {**options, "split": split, "heuristic": heuristic})
     chosen_scenarios = _checked_scenarios(task, split, scenarios)
-    watch_making(task.grid_id, *make_scenarios(task.grid_id, chosen_scenarios), progress)
     jobs = _jobs(chosen_scenarios, seeds, start)
+    watch_making(task.grid_id, *make_scenarios(task.grid_id, chosen_scenarios), progress)
     return run_evaluation(
         # The agent whose identity is stored, not its path: a run that still trains replaces the file.
         Setting(task.id, chosen, keywords),

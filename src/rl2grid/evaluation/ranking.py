@@ -46,6 +46,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import platformdirs
 from numpy.typing import NDArray
+from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from rl2grid.arrays import F32, F64, I32, Flags
@@ -137,6 +138,7 @@ def run_ranking(
     output: Path | None = None,
     work: Path | None = None,
     num_threads: int | None = None,
+    progress: bool = True,
 ) -> Path:
     """Rank the topology actions of a grid and write ``<output>/<grid>.ranking.npz``.
 
@@ -148,6 +150,7 @@ def run_ranking(
         output: folder of the result; by default ``rankings`` in the current folder.
         work: folder of the intermediate results; by default in the user's cache.
         num_threads: threads that try actions; None: one per processor core. No influence on the result.
+        progress: whether to show how far it is.
 
     Returns:
         The file written.
@@ -166,10 +169,10 @@ def run_ranking(
     make_folder(output)
     pack = scenario_pack_hash(grid_id, "train")
     folder = _work_folder(grid, work, f"{pack} {states} {seed} {sampling}")
-    with _progress(grid_id) as progress:
+    with _progress(grid_id, progress) as bar:
         laboratory = _Laboratory(grid, num_threads or os.cpu_count() or 1)
-        points, play = _collect(laboratory, states, seed, folder, progress)
-        trials = _try(laboratory, points, seed, sampling, folder, progress)
+        points, play = _collect(laboratory, states, seed, folder, bar)
+        trials = _try(laboratory, points, seed, sampling, folder, bar)
     scores = score(trials)
     closed, left_out = _lines_to_close(grid, play.tripped)
     shape = Shape(_n_covered(grid), grid.level_sizes[0] - 1, _switches(laboratory.catalogue, closed))
@@ -540,11 +543,13 @@ def _save(file: Path, **arrays: Any) -> None:
     os.replace(temporary, file)
 
 
-def _progress(grid_id: str) -> Progress:
+def _progress(grid_id: str, shown: bool) -> Progress:
     return Progress(
         TextColumn(grid_id + " {task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
+        console=Console(stderr=True),
+        disable=not shown,
     )

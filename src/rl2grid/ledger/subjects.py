@@ -99,21 +99,21 @@ def count_look(subject: Subject, results: Mapping[str, HashedTest]) -> str:
     return f"Look {len(done) + 1} of {LOOKS} at {months}.{after}"
 
 
-def play_test(subject: Subject) -> HashedTest:
-    """Play the test months; what the ledger keeps of it."""
-    best = _play(subject, subject.agent)
-    last = None if subject.last is None else _play(subject, subject.last)
+def play_test(subject: Subject, progress: bool = True) -> HashedTest:
+    """Play the test months, with a bar or without; what the ledger keeps of it."""
+    best = _play(subject, subject.agent, progress)
+    last = None if subject.last is None else _play(subject, subject.last, progress)
     return hashed_test(subject.configuration, subject.training, best, last)
 
 
-def _play(subject: Subject, agent: str | Path) -> Evaluation:
+def _play(subject: Subject, agent: str | Path, progress: bool) -> Evaluation:
     return evaluate(
         agent,
         subject.task,
         split=TEST,
         scenarios=first_months(subject.task, TEST, subject.configuration["test"]["months"]),
         heuristic=AS_TRAINED if subject.training else subject.heuristic,
-        progress=True,
+        progress=progress,
     )
 
 

@@ -7,14 +7,13 @@ training goes on from its checkpoint, an evaluation with the episodes that are m
 from __future__ import annotations
 
 import shlex
-import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import gymnasium
 from rich.console import Console
 
 from rl2grid.analysis.demo_report import write_demo_report
-from rl2grid.analysis.summary_table import rich_table
 from rl2grid.envs.registration import register_all
 from rl2grid.envs.tasks import find_task
 from rl2grid.errors import UsageError
@@ -23,6 +22,7 @@ from rl2grid.evaluation.flags import evaluate_command, flags
 from rl2grid.evaluation.protocol import evaluate
 from rl2grid.evaluation.recording import record_episode
 from rl2grid.records.evaluations import Evaluation
+from rl2grid.records.files import make_folder
 from rl2grid.records.recordings import Recording
 from rl2grid.records.trainings import read_training_curve
 from rl2grid.scenarios.library import list_scenarios
@@ -41,29 +41,36 @@ SEEDS = (0,)
 """Of maintenance and of the random agent: episodes per test month."""
 
 
-def run_demo(output: Path, decisions: int | None = None) -> Path:
+@dataclass(frozen=True)
+class Demonstration:
+    """What the demonstration made."""
+
+    report: Path
+    evaluations: tuple[Evaluation, ...]
+
+
+def run_demo(output: Path, decisions: int | None = None, *, progress: bool = True) -> Demonstration:
     """Train PPO with the idle heuristic on bus14, evaluate it on held-out months, write a report.
 
     Args:
         output: folder of the report, ``report.html`` in it; ``output / "run"`` holds the training.
         decisions: how long to train.
-
-    Returns:
-        The report.
+        progress: whether to show how far it is, on standard error.
 
     Raises:
         UsageError: ``decisions`` is too small, or ``output`` holds a training of another length.
     """
-    console, began = Console(), time.perf_counter()
+    make_folder(output)
+    console = Console(stderr=True, quiet=not progress)
     register_all()
     console.rule("1/4 Training PPO with the idle heuristic on bus14", align="left")
     console.print("Whenever a line is loaded to 95%, the agent chooses one of 50 topology actions.")
-    run = _train(output / "run", DECISIONS if decisions is None else decisions)
+    run = _train(output / "run", DECISIONS if decisions is None else decisions, progress)
     if not runs.is_finished(run):
         raise KeyboardInterrupt
 
     console.rule(f"2/4 Playing {MONTHS} months that no agent has seen", align="left")
-    results = [_evaluate(agent, heuristic, output) for agent, heuristic in _contestants(run)]
+    results = [_evaluate(agent, heuristic, output, progress) for agent, heuristic in _contestants(run)]
 
     console.rule("3/4 Recording one episode", align="left")
     recording = _record(run)
@@ -81,9 +88,7 @@ def run_demo(output: Path, decisions: int | None = None) -> Path:
         recordings=[recording],
         commands=dict.fromkeys(("training", "episodes"), demo_command(output, decisions)),
     )
-    console.print(rich_table([result.summary for result in results], title=f"{TASK}, test scenarios"))
-    console.print(f"Report: {report} ({time.perf_counter() - began:.0f} s)")
-    return report
+    return Demonstration(report, tuple(results))
 
 
 def demo_command(output: Path, decisions: int | None) -> str:
@@ -96,7 +101,7 @@ def _contestants(run: Path) -> list[tuple[str, str | None]]:
     return [("do-nothing", None), ("random", HEURISTIC), (str(run), HEURISTIC)]
 
 
-def _train(folder: Path, decisions: int) -> Path:
+def _train(folder: Path, decisions: int, progress: bool) -> Path:
     """Begin the run, or go on with it; a complete run is left as it is."""
     hyperparameters = request.hyperparameters("ppo", TASK, total_timesteps=decisions, num_envs=NUM_ENVS)
     if folder.exists():
@@ -110,11 +115,12 @@ def _train(folder: Path, decisions: int) -> Path:
         folder=folder,
         env_keywords={"heuristic": HEURISTIC},
         evaluate_every=max(decisions // 8, 1),
+        progress=progress,
     )
     return runs.train(args, evaluate=validator(args))
 
 
-def _evaluate(agent: str, heuristic: str | None, output: Path) -> Evaluation:
+def _evaluate(agent: str, heuristic: str | None, output: Path, progress: bool) -> Evaluation:
     name = agent if agent in ("do-nothing", "random") else "PPO"
     return evaluate(
         agent,
@@ -124,7 +130,7 @@ def _evaluate(agent: str, heuristic: str | None, output: Path) -> Evaluation:
         seeds=SEEDS,
         heuristic=heuristic,
         output=output / "evaluation" / name,
-        progress=True,
+        progress=progress,
         name=name,
         command=evaluate_command(agent, find_task(TASK), "test", len(SEEDS), MONTHS, {"heuristic": heuristic}),
     )

@@ -31,7 +31,7 @@ def train_command(args: request.RunArgs, preset: str = "default", folder: Path |
         words += ["--evaluate-every", str(args.evaluate_every)]
     if args.validation_months != request.RunArgs.validation_months:
         words += ["--validation-months", str(args.validation_months)]
-    words += [] if folder is None else ["--folder", str(folder)]
+    words += [] if folder is None else ["--output", str(folder)]
     return shlex.join(words)
 
 

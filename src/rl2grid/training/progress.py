@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 Show = Callable[[int, float | None, float | None], None]
@@ -29,7 +30,7 @@ def progress_bar(title: str, first: int, total: int, *, shown: bool) -> Iterator
         TextColumn("decisions, {task.fields[rate]}/s, survival {task.fields[survival]}, best {task.fields[best]}, ETA"),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, disable=not shown) as progress:
+    with Progress(*columns, console=Console(stderr=True), disable=not shown) as progress:
         bar = progress.add_task(title, total=total, completed=first, rate="-", survival="-", best="-")
         began = time.perf_counter()
 

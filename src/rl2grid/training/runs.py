@@ -21,7 +21,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -114,9 +114,12 @@ def resume(
     *,
     evaluate: Evaluate | None = None,
     limit: TimeLimit = UNLIMITED,
+    progress: bool = True,
     make_envs: Callable[[RunArgs], VectorEnvironment] = make_envs,
 ) -> Path:
     """Go on with the run in ``folder``, from its last checkpoint (or the beginning, if there is none yet).
+
+    ``progress`` says whether a bar is shown, which is not for one that was begun without.
 
     Raises:
         UsageError: no run there, one that another process is writing, or one made of other data.
@@ -131,6 +134,7 @@ def resume(
                     f"The run in {str(folder)!r} cannot be resumed: its {name} was {identity.get(name)}, "
                     f"now it is {now.get(name)}."
                 )
+        args = replace(args, progress=progress and args.progress)
         checkpoint = None
         if (folder / CHECKPOINT_FILE).exists():
             checkpoint = load_checkpoint(folder / CHECKPOINT_FILE, task=args.task.id)
