@@ -50,7 +50,7 @@ budget = 49_152
 algorithms = ["dqn", "sac"]
 tasks = ["bus14-T0"]
 heuristics = ["idle", "{closing}"]
-budget = 20_480
+budget = 10_240
 
 [[group]]
 algorithms = ["ppo"]
@@ -62,7 +62,7 @@ budget = 49_152
 algorithms = ["dqn", "sac"]
 tasks = ["bus36-MO-v0-T0"]
 heuristics = ["{closing}"]
-budget = 20_480
+budget = 10_240
 """
 STATE_FILE = "state.json"
 GRIDS = ("bus14", "bus36-MO-v0")
