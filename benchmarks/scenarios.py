@@ -25,7 +25,6 @@ from rl2grid.arrays import F32, F64, I32
 from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.engines.native.entry import reset_one, step_one
 from rl2grid.engines.native.orders import write_order
-from rl2grid.engines.native.series import outages_of
 from rl2grid.engines.native.what_if import WhatIf, snapshot_of
 from rl2grid.grids import GRID_IDS, Grid, find_system, load_grid
 from rl2grid.mdp.actions import DO_NOTHING, StepAction, level_catalogue, reconnect
@@ -37,7 +36,7 @@ from rl2grid.scenarios.generator.calendar import MONTH_ROWS, MONTH_STEPS, MONTHS
 from rl2grid.scenarios.generator.constants import Constants, load_constants
 from rl2grid.scenarios.generator.security import assess
 from rl2grid.scenarios.generator.year import generate_year
-from rl2grid.scenarios.maintenance import sample_maintenance
+from rl2grid.scenarios.maintenance import sample_outages
 from rl2grid.scenarios.scenario import Scenario
 from rl2grid.streams import Purpose, Stream
 
@@ -57,11 +56,11 @@ def begin_month(engine: NativeEngine, grid: Grid, seed: int, month: int) -> int:
     scenario = generate_month(grid, seed, month)
     stream = Stream(seed, month, Purpose.MAINTENANCE)
     config = find_system(grid.id).scenarios.maintenance(grid, "generated")
-    outages = sample_maintenance(config, scenario.start_datetime, scenario.n_rows, grid.n_line, stream)
+    outages = sample_outages(config, scenario.start_datetime, scenario.n_rows, stream)
     draws = None
     if grid.opponent.kind != "none":
         draws = draw_opponent(grid, Stream(seed, month, Purpose.OPPONENT), scenario.n_steps)
-    engine.begin(0, scenario, 0, scenario.n_steps, outages_of(outages), draws)
+    engine.begin(0, scenario, 0, scenario.n_steps, outages, draws)
     reset_one(engine.address, 0)
     return scenario.n_steps
 

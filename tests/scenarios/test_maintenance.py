@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as numpy_strategies
 from numpy.typing import NDArray
 
 from rl2grid.grids import MaintenanceConfig
-from rl2grid.scenarios.maintenance import maintenance_times, sample_maintenance
+from rl2grid.scenarios.maintenance import clipped_outages, maintenance_times, matrix_of, outages_of, sample_maintenance
 from rl2grid.streams import Purpose, Stream
 
 NAMES = tuple(f"line_{i}" for i in range(8))
@@ -120,3 +120,22 @@ def test_frequency_maximum_and_hours() -> None:
     assert days.sum() == working.sum()
     # Both drawn (1/16 of days): one of them stays, so each line is out on 1/4 - 1/32 of the days.
     assert working[:, :, 150, [0, 3]].mean(axis=(0, 1)) == pytest.approx([7 / 32] * 2, abs=0.02)
+
+
+@settings(max_examples=200, deadline=None)
+@given(numpy_strategies.arrays(np.bool_, st.tuples(st.integers(1, 40), st.integers(1, 3))), st.data())
+def test_outages_are_those_of_the_matrix_and_of_each_of_its_windows(matrix: NDArray[Any], data: st.DataObject) -> None:
+    n_rows, n_line = matrix.shape
+    outages = outages_of(matrix)
+    np.testing.assert_array_equal(matrix_of(outages, n_rows, n_line), matrix)
+    first = data.draw(st.integers(0, n_rows - 1))
+    length = data.draw(st.integers(1, n_rows - first))
+    shuffled = outages[data.draw(st.permutations(range(len(outages))))]
+    window = clipped_outages(shuffled, first, length)
+    assert window.dtype == np.int32
+    np.testing.assert_array_equal(window, outages_of(matrix[first : first + length]))
+
+
+def test_outages_that_meet_are_one() -> None:
+    outages = np.array([[3, 288, 576], [1, 5, 7], [3, 0, 288], [1, 7, 9], [1, 10, 12]])
+    assert clipped_outages(outages, 0, 1000).tolist() == [[1, 5, 9], [1, 10, 12], [3, 0, 576]]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid, find_system
 from rl2grid.scenarios.library import check_in_split, draw_scenario, load_scenario
-from rl2grid.scenarios.maintenance import sample_maintenance
+from rl2grid.scenarios.maintenance import clipped_outages, matrix_of, outages_of, sample_outages
 from rl2grid.scenarios.scenario import Scenario
 from rl2grid.scenarios.splits import TRAIN
 from rl2grid.streams import Purpose, Stream
@@ -91,7 +91,7 @@ def admissible_starts(n_steps: int) -> int:
     return n_steps - min(MIN_TRAINING_STEPS, (n_steps + 1) // 2) + 1
 
 
-def maintenance_matrix(grid: Grid, scenario: Scenario, plan: EpisodePlan) -> NDArray[np.bool_]:
+def planned_outages(grid: Grid, scenario: Scenario, plan: EpisodePlan) -> NDArray[np.int32]:
     """The planned outages of an episode.
 
     Recorded ones where the scenario records them; else sampled as the grid samples them, or, in generated months of
@@ -99,18 +99,24 @@ def maintenance_matrix(grid: Grid, scenario: Scenario, plan: EpisodePlan) -> NDA
     series has there.
 
     Returns:
-        bool [rows, line] for all rows of ``scenario`` (the episode begins in row ``plan.start``), read-only
-        where recorded.
+        int32 [outage, 3]: line, first row of ``scenario`` (the episode begins in row ``plan.start``), row after the
+        last; by line and row.
     """
     if not plan.maintenance:
-        return np.zeros((scenario.n_rows, grid.n_line), np.bool_)
+        return np.zeros((0, 3), np.int32)
     if scenario.maintenance is not None:
-        return scenario.maintenance
+        return outages_of(scenario.maintenance)
     stream = Stream(plan.seed, plan.number, Purpose.MAINTENANCE)
-    start, rows = scenario.series_start_datetime, scenario.series_rows
     config = find_system(grid.id).scenarios.maintenance(grid, scenario.source)
-    matrix = sample_maintenance(config, start, rows, grid.n_line, stream)
-    return matrix[scenario.first_row : scenario.first_row + scenario.n_rows]
+    sampled = sample_outages(config, scenario.series_start_datetime, scenario.series_rows, stream)
+    return clipped_outages(sampled, scenario.first_row, scenario.n_rows)
+
+
+def maintenance_matrix(grid: Grid, scenario: Scenario, plan: EpisodePlan) -> NDArray[np.bool_]:
+    """:func:`planned_outages` as bool [rows, line] for all rows of ``scenario``, read-only where recorded."""
+    if plan.maintenance and scenario.maintenance is not None:
+        return scenario.maintenance
+    return matrix_of(planned_outages(grid, scenario, plan), scenario.n_rows, grid.n_line)
 
 
 def _draw_start(grid: Grid, series: Scenario, seed: int, number: int) -> _Start:

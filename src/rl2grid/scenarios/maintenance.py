@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from datetime import date, datetime
+from datetime import datetime
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +15,9 @@ _ROWS_PER_DAY = 24 * STEPS_PER_HOUR
 _SATURDAY = 5
 
 
-def sample_maintenance(
-    config: MaintenanceConfig, start_datetime: datetime, n_rows: int, n_line: int, stream: Stream
-) -> NDArray[np.bool_]:
+def sample_outages(
+    config: MaintenanceConfig, start_datetime: datetime, n_rows: int, stream: Stream
+) -> NDArray[np.int32]:
     """Planned outages of a whole series, as ``GridStateFromFileWithForecastsWithMaintenance`` samples them.
 
     Every calendar date that the series touches except the last stands for 288 rows, counted from
@@ -27,22 +27,63 @@ def sample_maintenance(
     weekday is that of the day before, which is replicated.)
 
     Returns:
-        bool [rows, line], True where a line is out.
+        int32 [outage, 3]: line, first row, row after the last; by line and row.
     """
-    dates = _dates(start_datetime, n_rows)
-    lines = np.array(config.lines, dtype=np.int64)
-    draws = stream.uniform(len(dates) * 2 * len(lines)).reshape(len(dates), 2, len(lines))
+    weekday, month = _calendar(start_datetime, n_rows)
+    lines = np.array(config.lines, np.int64)
+    draws = stream.uniform(len(month) * 2 * len(lines)).reshape(len(month), 2, len(lines))
+    chance, priority = draws[:, 0], draws[:, 1]
+    drawn = (chance < np.array(config.monthly_daily_probability)[month, None]) & (weekday < _SATURDAY)[:, None]
+    ranked = np.argsort(np.where(drawn, priority, 2.0), axis=1, kind="stable")
+    most = np.minimum(drawn.sum(axis=1), np.array(config.monthly_max_per_day, np.int64)[month])
+    kept = np.zeros_like(drawn)
+    np.put_along_axis(kept, ranked, np.arange(len(lines)) < most[:, None], axis=1)
+    day, which = np.nonzero(kept)
+    first = day * _ROWS_PER_DAY
+    begin, end = first + config.start_hour * STEPS_PER_HOUR, first + config.end_hour * STEPS_PER_HOUR
+    return clipped_outages(np.stack([lines[which], begin, end], axis=1), 0, n_rows)
+
+
+def sample_maintenance(
+    config: MaintenanceConfig, start_datetime: datetime, n_rows: int, n_line: int, stream: Stream
+) -> NDArray[np.bool_]:
+    """:func:`sample_outages` as bool [rows, line], True where a line is out."""
+    return matrix_of(sample_outages(config, start_datetime, n_rows, stream), n_rows, n_line)
+
+
+def outages_of(matrix: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """Outages of a matrix [row, line], int32 [outage, 3]: line, first row, row after the last; by line and row."""
+    lines = np.flatnonzero(matrix.any(axis=0))
+    padded = np.zeros((len(lines), len(matrix) + 2), np.int8)
+    padded[:, 1:-1] = matrix[:, lines].T
+    change = np.diff(padded, axis=1)
+    which, begin = np.nonzero(change == 1)
+    _, end = np.nonzero(change == -1)
+    return np.stack([lines[which], begin, end], axis=1).astype(np.int32)
+
+
+def matrix_of(outages: NDArray[np.int32], n_rows: int, n_line: int) -> NDArray[np.bool_]:
+    """The inverse of :func:`outages_of`."""
     matrix = np.zeros((n_rows, n_line), np.bool_)
-    for day, (this, (chance, priority)) in enumerate(zip(dates, draws, strict=True)):
-        if this.weekday() >= _SATURDAY:
-            continue
-        out = chance < config.monthly_daily_probability[this.month - 1]
-        ranked = np.argsort(np.where(out, priority, 2.0), kind="stable")
-        kept = ranked[: min(int(out.sum()), config.monthly_max_per_day[this.month - 1])]
-        first = day * _ROWS_PER_DAY
-        rows = slice(first + config.start_hour * STEPS_PER_HOUR, first + config.end_hour * STEPS_PER_HOUR)
-        matrix[rows, lines[kept]] = True
+    for line, begin, end in outages.tolist():
+        matrix[begin:end, line] = True
     return matrix
+
+
+def clipped_outages(outages: NDArray[np.integer], first: int, n_rows: int) -> NDArray[np.int32]:
+    """The part of outages [outage, 3] that is in ``n_rows`` rows from ``first`` on, counted from there.
+
+    Returns:
+        As :func:`outages_of`: outages of a line of which one begins where the other ends are one.
+    """
+    line, begin = outages[:, 0], np.maximum(outages[:, 1] - first, 0)
+    end = np.minimum(outages[:, 2] - first, n_rows)
+    order = np.lexsort((begin, line))
+    order = order[begin[order] < end[order]]
+    line, begin, end = line[order], begin[order], end[order]
+    apart = np.ones(len(order), np.bool_)
+    apart[1:] = (line[1:] != line[:-1]) | (begin[1:] > end[:-1])
+    return np.stack([line[apart], begin[apart], end[np.append(apart[1:], True)[: len(order)]]], axis=1).astype(np.int32)
 
 
 def maintenance_times(matrix: NDArray[np.bool_]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
@@ -85,7 +126,8 @@ def _next_row(flags: NDArray[np.bool_]) -> NDArray[np.int64]:
     return result
 
 
-def _dates(start_datetime: datetime, n_rows: int) -> list[date]:
-    """The calendar dates that a series touches, except the last."""
+def _calendar(start_datetime: datetime, n_rows: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Weekday (0 is Monday) and month (0 .. 11) of the calendar dates that a series touches, except the last."""
     first, last = start_datetime.date(), (start_datetime + (n_rows - 1) * STEP).date()
-    return [date.fromordinal(ordinal) for ordinal in range(first.toordinal(), last.toordinal())]
+    dates = np.datetime64(first) + np.arange((last - first).days)
+    return (first.weekday() + np.arange(len(dates))) % 7, dates.astype("datetime64[M]").astype(np.int64) % 12

@@ -24,7 +24,6 @@ from rl2grid.engines.native.hidden_state import new_hidden_state
 from rl2grid.engines.native.imagination import imagined_rows, outlook_of
 from rl2grid.engines.native.orders import write_order
 from rl2grid.engines.native.playing import Playing, playing_named, playing_scenario
-from rl2grid.engines.native.series import outages_of
 from rl2grid.engines.native.worlds import RowLayout, restore_row, save_row
 from rl2grid.engines.worlds import Home, SeriesName, World, grid_fingerprint
 from rl2grid.errors import UsageError, one_of
@@ -35,7 +34,7 @@ from rl2grid.mdp.opponents import OpponentDraws, draw_opponent, load_draws
 from rl2grid.mdp.state import GridState
 from rl2grid.mdp.termination import GameOver
 from rl2grid.powerflow.model import Network, load_network
-from rl2grid.scenarios.episodes import EpisodePlan, maintenance_matrix
+from rl2grid.scenarios.episodes import EpisodePlan, planned_outages
 from rl2grid.scenarios.library import load_scenario
 from rl2grid.scenarios.scenario import Scenario
 from rl2grid.streams import Purpose, Stream
@@ -88,7 +87,7 @@ class NativeEngine:
     def prepare(self, i: int, plan: EpisodePlan) -> None:
         """Hand environment ``i`` the episode ``plan``; its first row is not shown yet."""
         scenario = load_scenario(self.grid.id, plan.scenario_id)
-        outages = outages_of(maintenance_matrix(self.grid, scenario, plan))
+        outages = planned_outages(self.grid, scenario, plan)
         draws = None
         if self._attacks:
             stream = Stream(plan.seed, plan.number, Purpose.OPPONENT)

@@ -11,7 +11,6 @@ import numpy as np
 from llvmlite import ir
 from numba.core import types
 from numba.core.extending import intrinsic
-from numpy.typing import NDArray
 
 from rl2grid.arrays import F32
 from rl2grid.compile import jit
@@ -120,14 +119,3 @@ def plan_outages(environments: Environments, i: int, step: int) -> None:
         begin = hidden.outage_begin[i, k]
         state.time_next_maintenance[i, line] = max(begin - step, 0)
         state.duration_next_maintenance[i, line] = hidden.outage_end[i, k] - max(begin, step)
-
-
-def outages_of(matrix: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """Outages of a matrix [row, line], int32 [outage, 3]: line, first row, row after the last; by line and row."""
-    lines = np.flatnonzero(matrix.any(axis=0))
-    padded = np.zeros((len(lines), len(matrix) + 2), np.int8)
-    padded[:, 1:-1] = matrix[:, lines].T
-    change = np.diff(padded, axis=1)
-    which, begin = np.nonzero(change == 1)
-    _, end = np.nonzero(change == -1)
-    return np.stack([lines[which], begin, end], axis=1).astype(np.int32)
