@@ -10,6 +10,8 @@ from __future__ import annotations
 import functools
 import hashlib
 import re
+import weakref
+from collections import deque
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -172,10 +174,33 @@ def _load_scenario(system: System, scenario_id: str, data: Path, full_data: Path
     return _find_scenario(system, scenario_id, data, full_data)
 
 
-# Fewer: there is no end of them, and the space of a removed copy is free again only when nothing maps it.
-@functools.lru_cache(maxsize=16)
-def _load_generated_scenario(system: System, scenario_id: str, data: Path) -> Scenario:
-    return _find_scenario(system, scenario_id, data, data)
+class _OpenMonths:
+    """Generated scenarios that somebody plays, and the latest that were opened.
+
+    There is no end of them, and the space of a copy that was removed is free again only when nothing maps it: what
+    nobody plays is let go soon. A hundred environments that play forty months open each of them once.
+    """
+
+    _LATEST = 16
+
+    def __init__(self) -> None:
+        self.cache_clear()
+
+    def __call__(self, system: System, scenario_id: str, data: Path) -> Scenario:
+        key = system, scenario_id, data
+        found = self._open.get(key)
+        if found is None:
+            found = self._open[key] = _find_scenario(system, scenario_id, data, data)
+            self._latest.append(found)
+        return found
+
+    def cache_clear(self) -> None:
+        """Open every scenario anew."""
+        self._open: weakref.WeakValueDictionary[tuple[System, str, Path], Scenario] = weakref.WeakValueDictionary()
+        self._latest: deque[Scenario] = deque(maxlen=self._LATEST)
+
+
+_load_generated_scenario = _OpenMonths()
 
 
 def _find_scenario(system: System, scenario_id: str, data: Path, full_data: Path) -> Scenario:
