@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import inspect
 import pickle
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -14,7 +15,7 @@ import rl2grid  # noqa: F401 - registers the tasks
 from rl2grid.cli import keywords
 from rl2grid.cli.main import main
 from rl2grid.envs.grid_env import PowerGridEnv
-from rl2grid.envs.options import OPTION_NAMES, TaskOptions, option_texts, options_of
+from rl2grid.envs.options import OPTION_NAMES, TaskOptions, changed_options, option_texts, options_of
 from rl2grid.envs.tasks import find_task
 from rl2grid.envs.vector import PowerGridVectorEnv
 from rl2grid.errors import UsageError
@@ -107,6 +108,57 @@ def test_help_shows_every_keyword_that_is_a_flag(command: list[str], capsys: pyt
         main(command)
     shown = capsys.readouterr().out
     assert all(f"--{name}" in shown for name in keywords.NAMES)
+
+
+def test_an_opponent_that_the_grid_has_not_is_refused_when_asked_for():
+    with pytest.raises(UsageError, match=r"^opponent=True is not allowed: bus14 has no opponent; leave it out"):
+        gymnasium.make("rl2grid/bus14-T0-v0", opponent=True)
+    assert options_of(find_task("bus36-MO-v0-T0"), {"opponent": True}).opponent
+    assert options_of(find_task("bus14-T0"), {"opponent": False, "heuristic": None}) == TaskOptions(opponent=False)
+    assert changed_options({"opponent": True, "heuristic": None, "reward": "paper", "more": 1}) == {
+        "reward": "paper",
+        "more": 1,
+    }
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        (
+            ["evaluate", "do-nothing", "bus14-T0", "--months", "999"],
+            "months=999 is not allowed: the split validation of",
+        ),
+        (["evaluate", "do-nothing", "bus14-T0", "--seeds", "-1"], "--seeds -1 is not allowed"),
+        (["evaluate", "do-nothing", "bus14-T0", "--reward", "1,2"], "Reward (1.0, 2.0) does not exist"),
+        (["evaluate", "do-nothing", "bus14-T0", "--opponent"], "bus14 has no opponent"),
+        (["train", "ppo", "bus14-T0", "--reward", "1,2"], "Reward (1.0, 2.0) does not exist"),
+        (["train", "ppo", "bus14-T0", "--opponent"], "bus14 has no opponent"),
+        (["train", "ppo", "bus14-T0", "--validation-months", "999"], "months=999 is not allowed"),
+    ],
+)
+def test_what_would_be_ignored_is_refused(
+    words: list[str], part: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.chdir(tmp_path)
+    assert main(words) == 2
+    (sentence,) = capsys.readouterr().err.strip().splitlines()
+    assert part in sentence
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("engine", ["native", "reference"])
+def test_closed_environments_say_so(engine: str):
+    here: dict[str, Any] = {"num_workers": 0} if engine == "reference" else {"num_threads": 1}
+    for env, action in (
+        (gymnasium.make("rl2grid/bus14-T0-v0", engine=engine, split="bundled"), 0),
+        (gymnasium.make_vec("rl2grid/bus14-T0-v0", 2, engine=engine, split="bundled", **here), [0, 0]),
+    ):
+        env.reset(seed=0)
+        env.close()
+        env.close()
+        for call in (lambda env=env, action=action: env.step(action), env.reset, env.unwrapped.action_masks):
+            with pytest.raises(UsageError, match=r"^The environment was closed: make another one\.$"):
+                call()
 
 
 def test_tasks_and_options_travel_to_other_processes_and_are_keys():

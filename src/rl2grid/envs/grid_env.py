@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from rl2grid.engines.transition import Listener
 from rl2grid.engines.worlds import World
+from rl2grid.envs.closed import closed
 from rl2grid.envs.description import TaskDescription, single_spaces
 from rl2grid.envs.options import keyword_names, options_of, shows_options
 from rl2grid.envs.task_environments import SimulationResult, TaskEnvironments
@@ -284,8 +285,9 @@ class PowerGridEnv(gymnasium.Env[NDArray[np.float32], Any], TaskDescription):
         return self._renderer.frame(episode_frames.scene_of(self.grid, self.state, 0), caption)
 
     def close(self) -> None:
-        """Free the simulator."""
+        """Free the simulator; nothing can be asked of the environment any more."""
         self._environments.close()
+        self._environments = closed()
 
     def _observation(self) -> NDArray[np.float32]:
         observation = np.zeros(self.observation_space.shape or (), np.float32)

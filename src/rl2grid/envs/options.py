@@ -68,7 +68,7 @@ class TaskOptions:
     maintenance: bool = True
     """Whether planned maintenance happens."""
     opponent: bool = True
-    """Whether the grid's opponent attacks."""
+    """Whether the grid's opponent attacks, if it has one."""
 
     def __post_init__(self) -> None:
         for option in fields(self):
@@ -115,7 +115,15 @@ def options_of(task: Task, keywords: Mapping[str, Any], allowed: Iterable[str] =
         if name not in OPTION_NAMES:
             raise one_of("Keyword", name, tuple(allowed))
     options = TaskOptions(**keywords)
+    if keywords.get("opponent") and task.grid.opponent.kind == "none":
+        raise UsageError(f"opponent=True is not allowed: {task.grid_id} has no opponent; leave it out.")
     return dataclasses.replace(options, constraint=constraint_of(task, options.constraint))
+
+
+def changed_options(keywords: Mapping[str, Any]) -> dict[str, Any]:
+    """The keywords that are not at their defaults: those filled in to be stored do not count as asked for."""
+    defaults = {option.name: option.default for option in fields(TaskOptions)}
+    return {name: value for name, value in keywords.items() if name not in defaults or value != defaults[name]}
 
 
 def shows_options(init: Function) -> Function:

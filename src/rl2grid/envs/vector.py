@@ -11,6 +11,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from rl2grid.engines.worlds import World
+from rl2grid.envs.closed import closed
 from rl2grid.envs.description import TaskDescription, single_spaces
 from rl2grid.envs.making_rows import make_rows
 from rl2grid.envs.options import keyword_names, options_of, shows_options
@@ -142,8 +143,9 @@ class PowerGridVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], Any, ND
         return self._present(self._rows.load_state_dict(rows))
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Free the simulators and end the workers."""
+        """Free the simulators and end the workers; nothing can be asked of the environments any more."""
         self._rows.close()
+        self._rows = closed()
 
     def _row(self, i: int) -> int:
         if not isinstance(i, int | np.integer) or not 0 <= i < self.num_envs:
