@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -110,6 +111,39 @@ def test_a_torn_checkpoint_is_refused(tmp_path: Path):
         path.write_bytes(whole[:length])
         with pytest.raises(UsageError, match="not a checkpoint"):
             load_checkpoint(path)
+
+
+def test_every_flipped_bit_is_noticed(tmp_path: Path):
+    path = tmp_path / "c.pt"
+    save_checkpoint(path, CONTENTS)
+    whole = path.read_bytes()
+    assert torch.load(path, weights_only=True)["format"] == 1  # still what torch.save writes
+    places = np.random.default_rng(0).integers(0, 8 * len(whole), 200).tolist()
+    for place in places:
+        damaged = bytearray(whole)
+        damaged[place // 8] ^= 1 << place % 8
+        path.write_bytes(damaged)
+        with pytest.raises(UsageError, match="not a checkpoint"):
+            load_checkpoint(path)
+
+
+def test_what_expands_is_refused(tmp_path: Path):
+    path = tmp_path / "c.pt"
+    save_checkpoint(path, {**CONTENTS, "large": torch.zeros(100_000)})
+    with zipfile.ZipFile(path) as plain, zipfile.ZipFile(tmp_path / "small.pt", "w", zipfile.ZIP_DEFLATED) as small:
+        for part in plain.infolist():
+            small.writestr(part.filename, plain.read(part))
+    with pytest.raises(UsageError, match="it is compressed"):
+        load_checkpoint(tmp_path / "small.pt")
+    torch.save({"format": 1, "task": "t", "large": torch.zeros(1).expand(10**9)}, path)
+    with pytest.raises(UsageError, match="it expands"):
+        load_checkpoint(path)
+    nested: list[Any] = []
+    for _ in range(60):
+        nested = [nested, nested]
+    torch.save({"format": 1, "task": "t", "nested": nested}, path)
+    with pytest.raises(UsageError, match="it expands"):
+        load_checkpoint(path)
 
 
 def test_a_missing_file_and_another_format_are_refused(tmp_path: Path):

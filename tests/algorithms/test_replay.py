@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import shutil
 from pathlib import Path
 from typing import Any
@@ -244,6 +246,32 @@ def test_half_written_files_do_no_harm(tmp_path: Path, memory_bytes: int):
     assert_same(straight.draw(300), again.draw(300))
 
 
+@STORAGE
+def test_files_with_a_flipped_bit_are_refused(tmp_path: Path, memory_bytes: int):
+    replay = memory(tmp_path, memory_bytes=memory_bytes)
+    fill(replay, 0, 33)
+    state = replay.state_dict()
+    del replay
+    files = [path for path in sorted(tmp_path.iterdir()) if path.stat().st_size]
+    assert {path.suffix for path in files} == {".rows", ".last"}
+    for path in files:
+        content = path.read_bytes()
+        path.write_bytes(bytes([content[0] ^ 4]) + content[1:])
+        with pytest.raises(UsageError, match="was changed since it was written"):
+            memory(tmp_path, memory_bytes=memory_bytes).load_state_dict(state)
+        path.write_bytes(content)
+    memory(tmp_path, memory_bytes=memory_bytes).load_state_dict(state)
+
+
+def test_a_full_disk_is_said_before_a_mapped_file_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def full(number: int, begin: int, size: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    with pytest.raises(OSError, match="No space left"):
+        memory(tmp_path, memory_bytes=0).add(step(0))
+
+
 def test_a_checkpoint_appends_what_is_new_and_removes_what_nobody_needs(tmp_path: Path, monkeypatch: Any):
     written = []
     from rl2grid.algorithms import replay as module
@@ -264,7 +292,7 @@ def test_a_checkpoint_appends_what_is_new_and_removes_what_nobody_needs(tmp_path
     segments = sorted(int(path.stem) for path in tmp_path.glob("*.rows"))
     # Needed: the 64 rows before the previous checkpoint, at row 380.
     assert segments == list(range((380 - replay.window_rows) // replay.segment_rows, -(-400 // replay.segment_rows)))
-    assert replay.state_dict().keys() == {"layout", "rows", "batches"}
+    assert replay.state_dict().keys() == {"layout", "rows", "batches", "sums"}
 
 
 def test_the_checkpoint_before_the_last_can_be_resumed_too(tmp_path: Path):

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+import itertools
+import json
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +17,18 @@ from rl2grid.agents.agent import Action, Info, Observation
 from rl2grid.algorithms.checkpoint import load_checkpoint
 from rl2grid.algorithms.registry import find_algorithm
 from rl2grid.envs.normalization import ObservationNormalizer
+from rl2grid.envs.options import changed_options
 from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
+from rl2grid.records.trainings import RUN_FILE, is_run, read_configuration
 from rl2grid.streams import Purpose, Stream
 
 BEST_FILE = "best.pt"
 """In a run folder: the policy with the highest validation survival so far."""
 CHECKPOINT_FILE = "checkpoint.pt"
 """In a run folder: everything needed to go on."""
+MAX_WEIGHT = 1e8
+"""A larger one is no weight that was learned."""
 
 
 class PolicyAgent:
@@ -39,9 +45,9 @@ class PolicyAgent:
         policy = contents["policy"]
         self.name = name or str(contents["algorithm"])
         self.task: str = contents["task"]
-        self.env_keywords: dict[str, Any] = dict(contents["env_keywords"])
-        """Keywords of the environments that it was trained in: play it with the same ``heuristic`` and
-        ``normalize``, unless the difference is what is studied."""
+        self.env_keywords: dict[str, Any] = changed_options(contents["env_keywords"])
+        """Keywords of the environments that it was trained in, those at their defaults left out: play it with the same
+        ``heuristic`` and ``normalize``, unless the difference is what is studied."""
         self.deterministic = deterministic
         self._network = find_algorithm(contents["algorithm"]).load_policy(policy)
         self._mask_actions = bool(policy["mask_actions"])
@@ -126,10 +132,66 @@ def load_agent(
         best = path / BEST_FILE
         path = best if best.is_file() else path / CHECKPOINT_FILE
     contents = load_checkpoint(path, task=None if task is None else find_task(task).id)
+    if is_run(path.parent):
+        _check_place(path, contents)
+    if "policy" not in contents and contents.get("decisions") == 0:
+        raise UsageError(f"Checkpoint {str(path)!r} has no policy yet: its run has just begun.")
     try:
+        _check_policy(path, contents["policy"])
         return PolicyAgent(contents, deterministic=deterministic, name=name)
     except KeyError as error:
         raise UsageError(f"Checkpoint {str(path)!r} lacks {error}: another version of rl2grid wrote it.") from error
+    except (AttributeError, RuntimeError, TypeError) as error:
+        reason = str(error).strip().split("\n")[0]
+        raise UsageError(f"Checkpoint {str(path)!r} holds no policy that can be played: {reason}.") from error
+
+
+def _check_place(path: Path, contents: Mapping[str, Any]) -> None:
+    """Refuse a checkpoint of another run than that of its folder.
+
+    Raises:
+        UsageError: they differ.
+    """
+    request = read_configuration(path.parent)["request"]
+    for name in ("task", "algorithm", "hyperparameters"):
+        if json.dumps(contents.get(name), sort_keys=True) != json.dumps(request[name], sort_keys=True):
+            raise UsageError(
+                f"Checkpoint {str(path)!r} is of a run with other {name} than {RUN_FILE} beside it says: give a folder "
+                "as 'rl2grid train' wrote it."
+            )
+
+
+def _check_policy(path: Path, policy: Mapping[str, Any]) -> None:
+    """Refuse numbers that no training ends with, and networks that are larger than the weights that are there.
+
+    Raises:
+        UsageError: which of them.
+    """
+    arrays = list(_arrays_of(policy))
+    if not all(bool(torch.isfinite(array).all()) for array in arrays if array.is_floating_point()):
+        raise UsageError(f"Checkpoint {str(path)!r} cannot be played: some of its numbers are infinite or none at all.")
+    weights = list(_arrays_of(policy["network"]))
+    if any(bool((array.abs() > MAX_WEIGHT).any()) for array in weights if array.is_floating_point()):
+        raise UsageError(f"Checkpoint {str(path)!r} cannot be played: some of its weights are beyond {MAX_WEIGHT:g}.")
+    there = sum(array.numel() for array in weights)
+    widths = [value for name, value in policy.items() if name.endswith("layers")]
+    needed = max((a * b for layers in widths for a, b in itertools.pairwise(layers)), default=0)
+    widest = max((width for layers in widths for width in layers), default=0)
+    if max(needed, widest, int(policy.get("n_costs", 0))) > there:
+        raise UsageError(f"Checkpoint {str(path)!r} cannot be played: its networks have other sizes than its weights.")
+
+
+def _arrays_of(value: Any) -> Iterator[torch.Tensor]:
+    if isinstance(value, torch.Tensor):
+        yield value
+    elif isinstance(value, np.ndarray) and value.dtype.kind in "fiub":
+        yield torch.from_numpy(np.array(value))
+    elif isinstance(value, Mapping):
+        for item in value.values():
+            yield from _arrays_of(item)
+    elif isinstance(value, list | tuple):
+        for item in value:
+            yield from _arrays_of(item)
 
 
 def _hash(network: torch.nn.Module) -> str:

@@ -21,7 +21,8 @@ Randomness
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -203,6 +204,7 @@ class ReplayMemory:
             return state
         for segment in self._segments.values():
             segment.save(self._filled(segment.number))
+        state["sums"] = {number: self._segments[number].sums for number in self._needed()}
         for path in self.folder.glob("*.*"):
             if path.stem.isdigit() and int(path.stem) < self._saved_first:
                 path.unlink(missing_ok=True)
@@ -213,7 +215,7 @@ class ReplayMemory:
         """Be what ``state_dict`` was called of, whatever the files have got since.
 
         Raises:
-            UsageError: the files are not there, or were of another memory.
+            UsageError: the files are not there, were changed, or are of another memory.
         """
         if state["layout"] != self._layout():
             raise UsageError("The replay memory of the checkpoint has another size or layout: it cannot be resumed.")
@@ -225,6 +227,7 @@ class ReplayMemory:
                 segment.load_state_dict(state["segments"][number])
             else:
                 segment.load(self.folder, self._filled(number), self.rows * self.num_envs, mapped=self.mapped)
+                segment.check(state.get("sums", {}).get(number, segment.sums))
             self._segments[number] = segment
         self._saved_first = self._first_row // self.segment_rows
         self._drawable = sum(
@@ -328,6 +331,7 @@ class _Segment:
         self._last_record = last_record
         self._row_bytes = shape[1] * record.itemsize
         self._saved_rows = self._saved_last = 0
+        self._rows_sum = self._last_sum = 0
 
     def begin(self, folder: Path | None, *, mapped: bool) -> None:
         """Be empty, with files of its own if there is a folder."""
@@ -353,6 +357,24 @@ class _Segment:
         self._add_last(self._last_path.read_bytes(), past_index)
         os.truncate(self._last_path, len(self.last) * self._last_record.itemsize)
         self._saved_rows, self._saved_last = filled, len(self.last)
+        self._rows_sum = zlib.crc32(self._records(0, filled))
+        self._last_sum = zlib.crc32(self._packed(list(self.last.items())))
+
+    @property
+    def sums(self) -> tuple[int, int]:
+        """Checksums of what the files hold."""
+        return self._rows_sum, self._last_sum
+
+    def check(self, sums: Sequence[int]) -> None:
+        """Refuse files that do not hold what was saved.
+
+        Raises:
+            UsageError: they were changed.
+        """
+        if tuple(sums) != self.sums:
+            raise UsageError(
+                f"The replay file {str(self._path)!r} was changed since it was written: the run cannot be resumed."
+            )
 
     def save(self, filled: int) -> None:
         """Append to the files what they lack of the first ``filled`` rows; on disk when this returns."""
@@ -362,10 +384,13 @@ class _Segment:
             self.data.flush()
         else:
             _write_at(self._path, self._saved_rows * self._row_bytes, self.data[self._saved_rows : filled].tobytes())
+        self._rows_sum = zlib.crc32(self._records(self._saved_rows, filled), self._rows_sum)
         self._saved_rows = filled
         new = list(self.last.items())[self._saved_last :]
         if new:
-            _write_at(self._last_path, self._saved_last * self._last_record.itemsize, self._packed(new))
+            content = self._packed(new)
+            _write_at(self._last_path, self._saved_last * self._last_record.itemsize, content)
+            self._last_sum = zlib.crc32(content, self._last_sum)
             self._saved_last = len(self.last)
 
     def state_dict(self) -> dict[str, Any]:
@@ -387,12 +412,16 @@ class _Segment:
 
     def _allocate(self, *, mapped: bool) -> None:
         if mapped:
-            os.truncate(self._path, self._shape[0] * self._row_bytes)
+            _reserve(self._path, self._shape[0] * self._row_bytes)
             self.data: NDArray[Any] = np.memmap(self._path, self._record, "r+", shape=self._shape)
         else:
             self.data = np.zeros(self._shape, self._record)
         # The same data as bytes [rows * num_envs, record], which are copied fastest.
         self.bytes = self.data.view(np.ndarray).reshape(-1).view(np.uint8).reshape(self.data.size, -1)
+
+    def _records(self, first: int, past: int) -> memoryview:
+        """The bytes of some rows."""
+        return np.ascontiguousarray(self.bytes[first * self._shape[1] : past * self._shape[1]]).data
 
     def _packed(self, last: list[tuple[int, NDArray[np.float32]]]) -> bytes:
         return np.array(last, self._last_record).tobytes()
@@ -403,6 +432,14 @@ class _Segment:
             if past_index is not None and index >= past_index:
                 return
             self.last[int(index)] = observation.copy()
+
+
+def _reserve(path: Path, size: int) -> None:
+    """Give a file its full size on disk: writing to a mapped file on a full disk would kill the process."""
+    with open(path, "r+b") as file:
+        file.truncate(size)
+        if hasattr(os, "posix_fallocate"):
+            os.posix_fallocate(file.fileno(), 0, size)
 
 
 def _write_at(path: Path, position: int, content: bytes) -> None:
