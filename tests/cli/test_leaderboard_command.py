@@ -27,6 +27,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (episode,) = contents["episodes"]
     episode["survival"] = 0.999
     episode["hash"] = episode_hash({column.name: episode[column.name] for column in FACTS})
+    del contents["checksum"]
     (folder / "forged.json").write_text(json.dumps(contents))
     return folder
 
@@ -92,23 +93,34 @@ def test_refusals_are_one_sentence(folder, tmp_path, capsys, words, part):
     assert "verified" not in captured.out
 
 
-@pytest.mark.parametrize("contents", [b"# A page\n", b"", b"{", b"\xff\xfe", b"{}", b"[]"])
-def test_a_file_that_is_something_else_is_refused_in_one_sentence(tmp_path, capsys, contents):
+@pytest.mark.parametrize(
+    ("contents", "why"),
+    [
+        (b"# A page\n", "line 1 is no JSON; "),
+        (b"", "it is empty; "),
+        (b"{", "line 1 is no JSON; "),
+        (b"\xff\xfe", "byte 0 is no UTF-8; "),
+        (b"{}", ""),
+        (b"[]", ""),
+        (100_000 * b"[", "it is nested too deeply; "),
+    ],
+)
+def test_a_file_that_is_something_else_is_refused_in_one_sentence(tmp_path, capsys, contents, why):
     page = tmp_path / "README.md"
     page.write_bytes(contents)
     for words in (["verify", str(page)], ["table", str(page)]):
         assert main(["leaderboard", *words]) == 2
         assert capsys.readouterr().err == (
-            f"rl2grid: {page} is no entry of a leaderboard: give files that 'rl2grid leaderboard entry' wrote, or a "
-            "ledger of test results as --ledger.\n"
+            f"rl2grid: {page} is no entry of a leaderboard: {why}give files that 'rl2grid leaderboard entry' wrote, or "
+            "a ledger of test results as --ledger.\n"
         )
     if contents == b"{}":  # an empty ledger
         return
     for words in (["table"], ["verify", "greedy@bus14-T0"], ["test", "greedy@bus14-T0"]):
         assert main(["leaderboard", *words, "--ledger", str(page)]) == 2
         assert capsys.readouterr().err == (
-            f"rl2grid: {page} is no ledger of test results: give a file that 'rl2grid leaderboard test' wrote, or one "
-            "that does not exist yet.\n"
+            f"rl2grid: {page} is no ledger of test results: {why or 'what it holds is []; '}give a file that 'rl2grid "
+            "leaderboard test' wrote, or one that does not exist yet.\n"
         )
     assert page.read_bytes() == contents
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
+from forged import rewrite
 from sample_folders import CELLS, write_made_up_evaluation, write_made_up_run, write_made_up_study
 
 from rl2grid.cli.main import main
@@ -67,9 +67,7 @@ def test_refusals_are_one_sentence_and_write_nothing(tmp_path: Path, capsys, nam
     write_made_up_evaluation(tmp_path / "one")
     write_made_up_evaluation(tmp_path / "other", "do-nothing", None)
     path = tmp_path / "other" / "evaluation.json"
-    record = json.loads(path.read_text())
-    record["identity"]["grid_hash"] = "another"
-    path.write_text(json.dumps(record))
+    rewrite(path, lambda record: record["identity"].update(grid_hash="another"))
     write_made_up_run(tmp_path / "run")
     (tmp_path / "run" / "metrics.csv").unlink()
     assert main(["report", *(str(tmp_path / name) for name in names), "--output", str(tmp_path / "page")]) == 2

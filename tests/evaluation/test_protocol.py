@@ -17,6 +17,7 @@ import gymnasium
 import numpy as np
 import pytest
 from fake_grid import LENGTH
+from forged import rewrite
 
 from rl2grid.agents.do_nothing import DoNothing
 from rl2grid.agents.random_agent import RandomAgent
@@ -30,9 +31,10 @@ from rl2grid.evaluation.crew import Job, Setting, make_crew
 from rl2grid.evaluation.episode import environment_seed, play_episode
 from rl2grid.evaluation.protocol import evaluate, run_evaluation
 from rl2grid.grids import GRID_IDS
-from rl2grid.records.episodes import EPISODES_FILE, Episode, read_episodes
+from rl2grid.records.episodes import EPISODES_FILE, Episode
 from rl2grid.records.evaluation_folder import PARTIAL_FILE
 from rl2grid.records.evaluations import EVALUATION_FILE, Evaluation, load_evaluation
+from rl2grid.records.files import DamageWarning
 from rl2grid.scenarios.generated import VERSION
 from rl2grid.scenarios.library import list_scenarios
 from rl2grid.training.request import hyperparameters
@@ -157,7 +159,7 @@ def test_an_interrupted_evaluation_plays_only_what_is_missing(tmp_path):
     log = tmp_path / "log"
     with pytest.raises(ValueError, match="told to fail"):
         play(output=tmp_path / "out", log=str(log), fail_on="may")
-    assert len(read_episodes(tmp_path / "out" / PARTIAL_FILE)) == 4
+    assert (tmp_path / "out" / PARTIAL_FILE).read_text().count("\n") == 1 + 4
     with pytest.raises(UsageError, match=r"is unfinished: continue it with again, with output='.*out'"):
         load_evaluation(tmp_path / "out")
     log.unlink()
@@ -210,6 +212,35 @@ def test_another_evaluation_is_not_mixed_in(tmp_path):
     with pytest.raises(UsageError, match="holds another evaluation, with a different scenarios or seeds"):
         play(output=tmp_path / "out", jobs=JOBS[:2])
     assert (tmp_path / "out" / EPISODES_FILE).read_text() == before
+
+
+def test_an_evaluation_is_not_written_among_other_files(tmp_path):
+    (tmp_path / "thesis.tex").write_text("")
+    with pytest.raises(UsageError, match="holds other files, and no evaluation"):
+        play(output=tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_a_damaged_row_is_played_again(tmp_path):
+    with pytest.raises(ValueError, match="told to fail"):
+        play(output=tmp_path / "out", fail_on="may")
+    partial = tmp_path / "out" / PARTIAL_FILE
+    lines = partial.read_text().splitlines(keepends=True)
+    partial.write_text("".join([lines[0], lines[1].replace(",", ",1", 1), *lines[2:]]))
+    with pytest.warns(DamageWarning, match=f"{len(lines) - 2} of its rows are whole and of this evaluation"):
+        result = play(output=tmp_path / "out")
+    assert without_times(result.episodes) == without_times(play().episodes)
+
+
+def test_rows_that_no_description_vouches_for_are_not_taken(tmp_path):
+    """A kill between the rows and their description leaves both files."""
+    play(output=tmp_path / "out")
+    rows = tmp_path / "out" / EPISODES_FILE
+    rewrite(tmp_path / "out" / "evaluation.json", lambda record: record.update(complete=False))
+    rows.write_text("half")
+    result = play(output=tmp_path / "out")
+    assert without_times(result.episodes) == without_times(play().episodes)
+    assert load_evaluation(tmp_path / "out").episodes == result.episodes
 
 
 def test_two_writers_do_not_mix(tmp_path):

@@ -48,7 +48,7 @@ def test_the_ledger_of_the_baselines_keeps_its_bytes(tmp_path: Path):
 @pytest.mark.parametrize("text", ["", "[]", "{", "# A page", json.dumps({"a": {"configuration": {}}})])
 def test_other_files_are_refused(tmp_path: Path, text: str):
     (tmp_path / "ledger.json").write_text(text)
-    with pytest.raises(UsageError, match=r"ledger\.json is no ledger of test results: give a file that 'rl2grid"):
+    with pytest.raises(UsageError, match=r"ledger\.json is no ledger of test results: .*; give a file that 'rl2grid"):
         read_ledger(tmp_path / "ledger.json")
     with pytest.raises(UsageError, match="cannot be read as a ledger of test results: Is a directory"):
         read_ledger(tmp_path)

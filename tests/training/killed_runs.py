@@ -13,7 +13,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import torch
 from toy_runs import falling, toy_envs, toy_run
 
 from rl2grid.algorithms import replay
@@ -111,20 +110,19 @@ class Csv:
 def die_while_saving(moment: Moment) -> None:
     """``before-write`` and ``mid-write`` of a checkpoint, ``before-replace`` and ``after-replace`` of any file."""
 
-    def save(value: Any, file: Any, original: Any = torch.save) -> None:
+    def sync(number: int, original: Any = os.fsync) -> None:
         moment.at("before-write")
-        original(value, file)
         if moment.is_next("mid-write"):
-            file.truncate(file.tell() // 2)
-            file.flush()
+            os.truncate(number, os.fstat(number).st_size // 2)
         moment.at("mid-write")
+        original(number)
 
     def replace(source: Any, target: Any, original: Any = os.replace) -> None:
         moment.at("before-replace")
         original(source, target)
         moment.at("after-replace")
 
-    torch.save, os.replace = save, replace
+    os.fsync, os.replace = sync, replace
 
 
 def die_while_recording(moment: Moment) -> None:
@@ -133,7 +131,6 @@ def die_while_recording(moment: Moment) -> None:
     def writer(self: Any, *arguments: Any, original: Any = metrics.MetricsFile.__init__, **keywords: Any) -> None:
         original(self, *arguments, **keywords)
         self._file = Csv(self._file, moment)
-        self._csv = metrics.csv.writer(self._file, lineterminator="\n")
 
     metrics.MetricsFile.__init__ = writer
 

@@ -14,14 +14,17 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from forged import rewrite
 from killed_runs import KILLED, refusal_of_a_second_process, run_until_killed
 from toy_grid import ToyGrid
-from toy_runs import SMALL, assert_same, assert_same_run, falling, request, toy_envs
+from toy_runs import SMALL, assert_same, assert_same_run, falling, request, table, toy_envs
 
 from rl2grid.algorithms.checkpoint import load_checkpoint, save_checkpoint
 from rl2grid.algorithms.policy_agent import PolicyAgent, load_agent
 from rl2grid.algorithms.ppo import Args
 from rl2grid.errors import UsageError
+from rl2grid.records.files import DamageWarning
+from rl2grid.training.limits import TimeLimit
 from rl2grid.training.request import RunArgs, hyperparameters
 from rl2grid.training.runs import is_finished, resume, train
 
@@ -71,9 +74,8 @@ def test_a_run_folder_holds_everything_about_the_run(tmp_path: Path):
 @pytest.mark.parametrize(("name", "value"), [("targets_version", 1), ("split_version", "1")])
 def test_a_run_of_another_list_or_other_targets_is_not_resumed(tmp_path: Path, name: str, value: Any):
     folder = train(request(tmp_path / "run"), evaluate=falling, make_envs=toy_envs)
-    config = json.loads((folder / "config.json").read_text())
-    now, config["identity"][name] = config["identity"][name], value
-    (folder / "config.json").write_text(json.dumps(config))
+    now = json.loads((folder / "config.json").read_text())["identity"][name]
+    rewrite(folder / "config.json", lambda config: config["identity"].update({name: value}))
     with pytest.raises(UsageError, match=f"cannot be resumed: its {name} was {value}, now it is {now}"):
         resume(folder, evaluate=falling, make_envs=toy_envs)
 
@@ -151,15 +153,13 @@ def test_a_folder_without_a_run_is_not_resumed(tmp_path: Path):
     with pytest.raises(UsageError, match=r"no config\.json"):
         resume(tmp_path, make_envs=toy_envs)
     (tmp_path / "config.json").write_text("{")
-    with pytest.raises(UsageError, match="does not describe a run"):
+    with pytest.raises(UsageError, match="is no description of a run: line 1 is no JSON"):
         resume(tmp_path, make_envs=toy_envs)
 
 
 def test_a_run_is_not_resumed_with_other_data(tmp_path: Path):
     folder = train(request(tmp_path / "run"), make_envs=toy_envs)
-    config = json.loads((folder / "config.json").read_text())
-    config["identity"]["action_set_hash"] = "0123"
-    (folder / "config.json").write_text(json.dumps(config))
+    rewrite(folder / "config.json", lambda config: config["identity"].update(action_set_hash="0123"))
     with pytest.raises(UsageError, match="action_set_hash was 0123"):
         resume(folder, make_envs=toy_envs)
 
@@ -171,6 +171,71 @@ def test_a_checkpoint_of_another_version_is_not_resumed(tmp_path: Path):
     save_checkpoint(folder / "checkpoint.pt", contents)
     with pytest.raises(UsageError, match="lacks 'best_score', because another version of rl2grid wrote it"):
         resume(folder, make_envs=toy_envs)
+
+
+def test_a_run_whose_checkpoint_is_gone_is_not_begun_again(tmp_path: Path):
+    folder = train(request(tmp_path / "run"), evaluate=falling, make_envs=toy_envs)
+    (folder / "checkpoint.pt").unlink()
+    before = {name: (folder / name).read_bytes() for name in ("best.pt", "metrics.csv", "energy.json", "log.txt")}
+    with pytest.raises(UsageError, match=r"cannot be resumed: its checkpoint\.pt is missing, and to begin again would"):
+        resume(folder, evaluate=falling, make_envs=toy_envs)
+    (folder / "checkpoint.pt").write_bytes(b"PK")
+    with pytest.raises(UsageError, match="is not a checkpoint that can be read"):
+        resume(folder, evaluate=falling, make_envs=toy_envs)
+    assert {name: (folder / name).read_bytes() for name in before} == before
+
+
+def test_the_checkpoint_of_another_run_is_not_gone_on_with(tmp_path: Path):
+    folder = train(request(tmp_path / "run"), make_envs=toy_envs)
+    other = train(request(tmp_path / "other", hyperparameters=replace(SMALL, seed=6)), make_envs=toy_envs)
+    (folder / "checkpoint.pt").write_bytes((other / "checkpoint.pt").read_bytes())
+    with pytest.raises(UsageError, match="of a run with other hyperparameters than its config"):
+        resume(folder, make_envs=toy_envs)
+
+
+def test_a_run_that_has_just_begun_has_no_policy(tmp_path: Path):
+    def end(args: RunArgs) -> Any:
+        envs = toy_envs(args)
+        envs.step = lambda actions: 1 / 0  # type: ignore[method-assign]
+        return envs
+
+    with pytest.raises(ZeroDivisionError):
+        train(request(tmp_path / "run"), make_envs=end)
+    with pytest.raises(UsageError, match="has no policy yet: its run has just begun"):
+        load_agent(tmp_path / "run")
+    assert is_finished(resume(tmp_path / "run", make_envs=toy_envs))
+
+
+def test_damaged_decoration_is_set_aside_and_the_run_goes_on(tmp_path: Path):
+    straight = train(request(tmp_path / "straight"), evaluate=falling, make_envs=toy_envs)
+    folder = train(request(tmp_path / "run"), evaluate=falling, limit=TimeLimit(1e-9), make_envs=toy_envs)
+    (folder / "energy.json").write_bytes(b"[[[")
+    (folder / "metrics.csv").write_bytes(b"\xff\xfe\x00" * 100)
+    with pytest.warns(DamageWarning, match="set aside as") as warned:
+        resume(folder, evaluate=falling, make_envs=toy_envs)
+    assert {str(each.message).rsplit(" ", 1)[1] for each in warned} == {"energy.json.damaged.", "metrics.csv.damaged."}
+    assert is_finished(folder)
+    rows = table(straight)
+    assert table(folder).equals(rows[rows["step"] > 32].reset_index(drop=True))
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -4e37])
+def test_weights_that_nobody_learned_are_not_played(tmp_path: Path, value: float):
+    folder = train(request(tmp_path / "run"), evaluate=falling, make_envs=toy_envs)
+    contents = load_checkpoint(folder / "best.pt")
+    next(iter(contents["policy"]["network"].values())).reshape(-1)[3] = value
+    save_checkpoint(folder / "best.pt", contents)
+    with pytest.raises(UsageError, match=r"best\.pt' cannot be played: some of its (numbers|weights) are"):
+        load_agent(folder)
+
+
+def test_networks_larger_than_their_weights_are_not_built(tmp_path: Path):
+    folder = train(request(tmp_path / "run"), make_envs=toy_envs)
+    contents = load_checkpoint(folder / "checkpoint.pt")
+    contents["policy"]["actor_layers"] = [10**6, 10**6]
+    save_checkpoint(folder / "checkpoint.pt", contents)
+    with pytest.raises(UsageError, match="its networks have other sizes than its weights"):
+        load_agent(folder)
 
 
 def test_a_run_has_one_writer(tmp_path: Path):
@@ -231,7 +296,7 @@ def test_a_second_interrupt_ends_the_run_at_once(tmp_path: Path):
 
     with pytest.raises(KeyboardInterrupt):
         train(request(tmp_path / "run"), make_envs=lambda args: Interrupting(4, gamma=0.9))
-    assert not (tmp_path / "run" / "checkpoint.pt").exists()
+    assert load_checkpoint(tmp_path / "run" / "checkpoint.pt")["decisions"] == 0
     assert not is_finished(tmp_path / "run")
 
 

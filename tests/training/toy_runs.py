@@ -80,7 +80,7 @@ def falling(agent: PolicyAgent) -> Mapping[str, float]:
 
 def table(folder: Path) -> pd.DataFrame:
     """The metrics of a run that do not depend on the speed of the machine."""
-    metrics = pd.read_csv(folder / "metrics.csv").drop(columns="wall_time")
+    metrics = pd.read_csv(folder / "metrics.csv").drop(columns=["wall_time", "checksum"])
     return metrics[~metrics["name"].isin(TIMES)].reset_index(drop=True)
 
 

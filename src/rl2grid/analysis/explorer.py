@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from typing import Any
 
+from rl2grid.analysis.page import embedded, filled
 from rl2grid.envs.tasks import short_id
 from rl2grid.mdp.termination import GAME_OVER_TEXT, GameOver
 from rl2grid.records.episodes import Episode
@@ -69,10 +69,8 @@ def explorer_html(results: Sequence[Evaluation], made_by: Sequence[str]) -> str:
         results: evaluations.
         made_by: of each of them, the id of the element of the page that has its command.
     """
-    # Inside a script element, only "</" would end it.
-    data = json.dumps(explorer_data(results, made_by), separators=(",", ":")).replace("</", "<\\/")
-    body = _resource("explorer.html")
-    return body.replace("{script}", _resource("explorer.js")).replace("{data}", data)
+    data = embedded(explorer_data(results, made_by))
+    return filled(_resource("explorer.html"), script=_resource("explorer.js"), data=data)
 
 
 def explorer_data(results: Sequence[Evaluation], made_by: Sequence[str]) -> dict[str, Any]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import io
 import itertools
-import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -37,6 +36,7 @@ from rl2grid.drawing.theme import (
     style,
 )
 from rl2grid.records.evaluations import Evaluation
+from rl2grid.records.files import write_bytes
 from rl2grid.records.metrics import SURVIVAL
 from rl2grid.records.recordings import Recording
 from rl2grid.records.statistics import curve_band, episode_mean
@@ -184,9 +184,7 @@ def save_figure(figure: Figure, path: Path, *, formats: Sequence[str] = ("png", 
     written = []
     for suffix in formats:
         target = path.with_name(f"{path.name}.{suffix}")
-        temporary = path.with_name(f"{path.name}.{suffix}.tmp")
-        temporary.write_bytes(_render(figure, suffix))
-        os.replace(temporary, target)
+        write_bytes(target, _render(figure, suffix))
         written.append(target)
     return written
 

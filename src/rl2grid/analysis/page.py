@@ -6,19 +6,29 @@ import base64
 import html
 import itertools
 import json
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from rl2grid.analysis.table import Cell, ResultTable
 from rl2grid.records.evaluations import identity_hash
-from rl2grid.records.files import write_text
+from rl2grid.records.files import printable, write_text
 
 
 def write_page(path: Path, title: str, parts: Sequence[str]) -> None:
     """Write one HTML page that needs no other file, in the place of an earlier one; ``parts`` are HTML."""
-    page = _PAGE.replace("{title}", html.escape(title)).replace("{body}", "\n".join(parts))
-    write_text(path, page)
+    write_text(path, filled(_PAGE, title=html.escape(printable(title)), body="\n".join(parts)))
+
+
+def filled(template: str, **parts: str) -> str:
+    """A template with a text in the place of each ``{name}``; what looks like one in a text stays as it is."""
+    return re.sub("|".join(rf"\{{{name}\}}" for name in parts), lambda found: parts[found[0][1:-1]], template)
+
+
+def embedded(value: Any) -> str:
+    """A value as JSON that may stand inside a script element, where no text of it can end or begin an element."""
+    return json.dumps(value, separators=(",", ":")).replace("<", "\\u003c")
 
 
 def facts_html(facts: Sequence[tuple[str, str]]) -> str:

@@ -136,10 +136,10 @@ def result_table_rich(table: ResultTable, title: str | None = None) -> Table:
     from rich.text import Text
 
     shown = Table(
-        title=title or table.name,
+        title=Text(title or table.name),
         title_justify="left",
         title_style="bold",
-        caption=table.caption,
+        caption=Text(table.caption),
         caption_justify="left",
         box=rich.box.SIMPLE_HEAD,
         pad_edge=False,

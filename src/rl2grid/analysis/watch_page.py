@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import base64
 import html
-import json
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -18,10 +17,11 @@ import numpy as np
 from matplotlib.colors import to_hex
 from numpy.typing import NDArray
 
-from rl2grid.analysis.page import write_page
+from rl2grid.analysis.page import embedded, filled, write_page
 from rl2grid.drawing.grid_drawing import geometry_of, largest_power, loading_colours
 from rl2grid.drawing.theme import DARK, FULL_SCALE, LIGHT, Theme
 from rl2grid.grids import Grid
+from rl2grid.records.files import printable
 from rl2grid.records.recordings import Recording
 
 MAX_LOADING = 255
@@ -37,12 +37,9 @@ def write_watch_page(path: Path, grid: Grid, recording: Recording) -> None:
     task = recording.task.removeprefix("rl2grid/")
     with_heuristic = "" if recording.heuristic == "none" else f" + {recording.heuristic}"
     title = f"{recording.agent}{with_heuristic} on {task}, {recording.scenario}, seed {recording.seed}"
-    # Inside a script element, only "</" would end it.
-    data = json.dumps(page_data(grid, recording), separators=(",", ":")).replace("</", "<\\/")
-    parts = {"title": html.escape(title), "legend": _legend(grid), "data": data, "script": _resource("watch_page.js")}
-    body = _resource("watch_page.html")
-    for name, text in parts.items():
-        body = body.replace(f"{{{name}}}", text)
+    data, script = embedded(page_data(grid, recording)), _resource("watch_page.js")
+    shown = html.escape(printable(title))
+    body = filled(_resource("watch_page.html"), title=shown, legend=_legend(grid), data=data, script=script)
     write_page(path, title, [body])
 
 

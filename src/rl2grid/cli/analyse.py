@@ -9,6 +9,7 @@ from pathlib import Path
 from rl2grid.cli.output import Output
 from rl2grid.errors import UsageError
 from rl2grid.records.collection import collect
+from rl2grid.records.files import check_own
 from rl2grid.scenarios.splits import SPLITS
 
 THEMES = ("light", "dark")
@@ -40,6 +41,7 @@ def _run(options: argparse.Namespace, output: Output) -> int:
     except ImportError as error:
         raise UsageError(f"Figures need {error.name}: install it with `pip install rl2grid[analysis]`.") from None
     plan = section.plan_section(results, runs)
+    check_own(options.output, (section.INDEX_FILE, section.TABLES_FOLDER), "analysis")
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
     with output.progress(*columns, transient=True) as bar:
         task = bar.add_task("Analysing", total=len(plan.tables) + len(plan.pictures))

@@ -8,6 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from rl2grid.cli.output import Output
+from rl2grid.errors import UsageError
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -18,9 +19,13 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace, output: Output) -> int:
-    from rl2grid.analysis.summary_table import summary_table
-    from rl2grid.studies.demo import TASK, run_demo
-
+    try:
+        from rl2grid.analysis.summary_table import summary_table
+        from rl2grid.studies.demo import TASK, run_demo
+    except ImportError as error:
+        raise UsageError(
+            f"The demonstration needs {error.name}: install it with `pip install rl2grid[train,analysis]`."
+        ) from None
     began = time.perf_counter()
     made = run_demo(options.output, decisions=options.decisions, progress=output.talks)
     summaries = [evaluation.summary for evaluation in made.evaluations]

@@ -55,6 +55,8 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 def _run(options: argparse.Namespace, output: Output) -> int:
     task = find_task(options.task)
     agents: Sequence[str] = options.agents
+    if options.seeds < 1:
+        raise UsageError(f"--seeds {options.seeds} is not allowed: give a number of episodes per month, at least 1.")
     if len(set(agents)) < len(agents):
         raise UsageError("An agent was named twice: name each once.")
     if options.output is not None and len(agents) > 1:

@@ -6,6 +6,7 @@ import argparse
 from typing import Any
 
 from rl2grid.envs.options import option_texts, options_without
+from rl2grid.mdp.rewards import resolve_reward
 
 GIVEN_OTHERWISE = ("split", "scenario", "gamma")
 """Keywords that a command gives itself, or asks for in another way."""
@@ -51,8 +52,14 @@ def given(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def reward_of(text: str) -> str | tuple[float, ...]:
-    """The keyword ``reward`` that a name, or weights separated by commas, stand for."""
+    """The keyword ``reward`` that a name, or weights separated by commas, stand for.
+
+    Raises:
+        UsageError: it is neither.
+    """
     try:
-        return tuple(float(part) for part in text.split(","))
+        reward: str | tuple[float, ...] = tuple(float(part) for part in text.split(","))
     except ValueError:
-        return text
+        reward = text
+    resolve_reward(reward)
+    return reward

@@ -84,6 +84,8 @@ def _entry(options: argparse.Namespace, output: Output) -> int:
     folder = find_evaluation(options.folder, options.split)
     if not options.output.parent.is_dir():
         raise UsageError(f"Folder {options.output.parent} of the output does not exist.")
+    if options.output.exists():
+        raise UsageError(f"{options.output} exists already: remove it, or give another name as --output.")
     with _playing(output, "Playing", len(load_evaluation(folder).episodes)) as show:
         entry = make_entry(folder, agent=options.agent, label=options.label, on_progress=show)
     write_entry(options.output, entry)

@@ -7,14 +7,18 @@ result. What a user did wrong is said in one sentence, without a traceback, with
 from __future__ import annotations
 
 import argparse
+import contextlib
+import errno
 import sys
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
 from importlib import import_module
 from typing import Any, NoReturn
 
 from rl2grid import __version__
 from rl2grid.cli.output import Output
 from rl2grid.errors import UsageError
+from rl2grid.records.files import DamageWarning, printable
 
 REFUSED = 2
 INTERRUPTED = 130
@@ -70,17 +74,46 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
     command_line = sys.argv[1:] if arguments is None else list(arguments)
     try:
-        return _run(command_line)
+        with _warnings_as_sentences():
+            return _run(command_line)
     except UsageError as error:
-        print(f"rl2grid: {error}", file=sys.stderr)
+        print(f"rl2grid: {printable(str(error))}", file=sys.stderr)
         return REFUSED
-    except KeyboardInterrupt:
-        print("rl2grid: interrupted; the same command goes on where it stopped.", file=sys.stderr)
-        return INTERRUPTED
     except BrokenPipeError:
         # The reader of our output went away (for example `| head`): nobody is left to tell.
         sys.stderr.close()
         return 0
+    except OSError as error:
+        print(f"rl2grid: {printable(_about_files(error))}", file=sys.stderr)
+        return REFUSED
+    except KeyboardInterrupt:
+        print("rl2grid: interrupted; the same command goes on where it stopped.", file=sys.stderr)
+        return INTERRUPTED
+
+
+def _about_files(error: OSError) -> str:
+    """What a disk that is full or may not be written, or a file that is not there, comes to in one sentence."""
+    what = f"{error.filename} cannot be read or written" if error.filename else "A file cannot be read or written"
+    reason = error.strerror or str(error) or type(error).__name__
+    full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+    return f"{what}: {reason}{'; make room, and begin or resume again' if full else ''}."
+
+
+@contextlib.contextmanager
+def _warnings_as_sentences() -> Iterator[None]:
+    """Say what was damaged as a sentence, without the line of code that found it."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", DamageWarning)
+        usual = warnings.showwarning
+
+        def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
+            if issubclass(category, DamageWarning):
+                print(f"rl2grid: {printable(str(message))}", file=sys.stderr)
+            else:
+                usual(message, category, *place, **more)
+
+        warnings.showwarning = show
+        yield
 
 
 def _run(command_line: list[str]) -> int:

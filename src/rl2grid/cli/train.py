@@ -14,7 +14,7 @@ from rl2grid.algorithms.registry import algorithm_names
 from rl2grid.cli.keywords import flag_text, reward_of
 from rl2grid.cli.main import INTERRUPTED
 from rl2grid.cli.output import Output
-from rl2grid.envs.options import TaskOptions, options_of, options_without
+from rl2grid.envs.options import TaskOptions, changed_options, options_of, options_without
 from rl2grid.envs.tasks import Task, find_task, short_id
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.flags import flag_of
@@ -125,6 +125,7 @@ def _begin(algorithm: str, task_id: str, flags: list[str]) -> int:
     own, keywords, hyperparameters = _parse_all(f"rl2grid train {algorithm} {task.id}", flags, hyperparameters)
     limit, output = TimeLimit(own.max_minutes), Output(json=own.json, quiet=own.quiet)
     keywords["reward"] = reward_of(keywords["reward"])
+    keywords = {name: value for name, value in keywords.items() if _is_given(name, flags)} | changed_options(keywords)
     options_of(task, keywords)
     args = request.RunArgs(
         task=task,
@@ -169,6 +170,11 @@ def _report(folder: Path, task: Task, limit: TimeLimit, output: Output) -> int:
         return INTERRUPTED
     output.text(f"Run complete: {folder}. Evaluate it with `rl2grid evaluate {folder} {short_id(task.id)}`.")
     return 0
+
+
+def _is_given(name: str, flags: list[str]) -> bool:
+    """Whether a keyword of the environment stands among the flags, at its default or not."""
+    return any(flag.split("=", 1)[0].replace("_", "-") == f"--{name}" for flag in flags)
 
 
 def _preset(flags: list[str]) -> str:

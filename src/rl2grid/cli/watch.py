@@ -56,6 +56,7 @@ def _run(options: argparse.Namespace, output: Output) -> int:
             recording = _play(task, options, progress)
             name = f"{task.id.removeprefix('rl2grid/')}-{recording.agent}-{recording.scenario.replace('/', '-')}"
             path = options.output / f"{name}-{options.seed}"
+            there = [suffix for suffix in options.format if path.with_name(f"{path.name}.{suffix}").exists()]
             for suffix in options.format:
                 target = path.with_name(f"{path.name}.{suffix}")
                 if suffix == "html":
@@ -71,8 +72,8 @@ def _run(options: argparse.Namespace, output: Output) -> int:
     ending = f"game over: {recording.game_over}" if recording.game_over else "alive at the end"
     output.text(f"{recording.n_steps:,} of {recording.episode_length:,} steps, {acted:,} actions; {ending}.")
     files = [f"{path}.{suffix}" for suffix in options.format]
-    for file in files:
-        output.remark(f"Written: {file}")
+    for suffix, file in zip(options.format, files, strict=True):
+        output.remark(f"{'Replaced' if suffix in there else 'Written'}: {file}")
     output.results(
         steps=recording.n_steps,
         episode_length=recording.episode_length,

@@ -8,9 +8,11 @@ from contextlib import contextmanager
 
 import rich.progress
 from rich.console import Console
+from rich.markup import escape
 
 from rl2grid.evaluation.crew import Job, Progress, Setting
 from rl2grid.records.episodes import Episode
+from rl2grid.records.files import printable
 
 
 class Display:
@@ -36,7 +38,9 @@ class ProgressBar(Display):
         self._steps: dict[Job, int] = {}
         self._finished = 0
         self._n_jobs = n_jobs
-        self._id = bar.add_task(f"Evaluating {setting.agent.name}", total=n_jobs, rate="", count=f"0/{n_jobs}")
+        self._id = bar.add_task(
+            f"Evaluating {escape(printable(setting.agent.name))}", total=n_jobs, rate="", count=f"0/{n_jobs}"
+        )
 
     def skip(self, jobs: Iterable[Job]) -> None:
         self._shares |= dict.fromkeys(jobs, 1.0)

@@ -18,16 +18,18 @@ from pathlib import Path
 from typing import Any
 
 from rl2grid.agents.agent import Agent
-from rl2grid.envs.options import TaskOptions
+from rl2grid.envs.options import TaskOptions, options_of
 from rl2grid.envs.tasks import Task, constraint_of, find_task
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import make_agent
 from rl2grid.evaluation.crew import Job, Setting, make_crew
 from rl2grid.evaluation.progress import show_progress, watch_making
 from rl2grid.mdp.actions import action_set_hash
+from rl2grid.mdp.rewards import resolve_reward
 from rl2grid.records.episodes import Episode
 from rl2grid.records.evaluation_folder import open_store
 from rl2grid.records.evaluations import Evaluation, labels
+from rl2grid.records.files import printable
 from rl2grid.records.versions import library_versions
 from rl2grid.scenarios.library import (
     check_in_split,
@@ -88,6 +90,8 @@ def evaluate(
     task = find_task(task)
     chosen = make_agent(agent, task) if isinstance(agent, str | Path) else agent
     keywords = env_keywords(chosen, {**options, "split": split, "heuristic": heuristic})
+    options_of(task, keywords)
+    resolve_reward(keywords.get("reward", "default"))
     chosen_scenarios = _checked_scenarios(task, split, scenarios)
     jobs = _jobs(chosen_scenarios, seeds, start)
     watch_making(task.grid_id, *make_scenarios(task.grid_id, chosen_scenarios), progress)
@@ -95,7 +99,7 @@ def evaluate(
         # The agent whose identity is stored, not its path: a run that still trains replaces the file.
         Setting(task.id, chosen, keywords),
         jobs,
-        identity=_identity(task, chosen, name or chosen.name, keywords, start, chosen_scenarios),
+        identity=_identity(task, chosen, printable(name or chosen.name), keywords, start, chosen_scenarios),
         command=command or _call(agent, task, keywords, scenarios, seeds, start, name),
         workers=_number_of_workers(workers, TaskOptions(**keywords).engine, agent, len(jobs)),
         output=output,
@@ -104,14 +108,27 @@ def evaluate(
 
 
 def first_months(task: Task, split: str, months: int | None) -> tuple[str, ...]:
-    """The first scenarios of a split, of all seasons alike; ``months`` None, or more than there are: all.
+    """The first scenarios of a split, of all seasons alike; ``months`` None: all.
+
+    Raises:
+        UsageError: no such split, or a number of months below 1 or above what there is.
+    """
+    listed = list_scenarios(task.grid_id, split)
+    if months is not None and not 1 <= months <= len(listed):
+        raise UsageError(
+            f"months={months} is not allowed: the split {split} of {task.grid_id} has {len(listed)}; give a number "
+            f"from 1 to {len(listed)}."
+        )
+    return listed[:months]
+
+
+def at_most(task: Task, split: str, months: int | None) -> tuple[str, ...]:
+    """:func:`first_months` of a number that nobody asked for: all where there are fewer.
 
     Raises:
         UsageError: no such split, or a number of months below 1.
     """
-    if months is not None and months < 1:
-        raise UsageError(f"months={months} is not allowed: give a number of months, at least 1.")
-    return list_scenarios(task.grid_id, split)[:months]
+    return first_months(task, split, None if months is None else min(months, len(list_scenarios(task.grid_id, split))))
 
 
 def run_evaluation(

@@ -34,9 +34,13 @@ they are there; a run that was interrupted continues where it was.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import io
 import json
 import os
+import zipfile
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -58,7 +62,7 @@ from rl2grid.grids import Grid, find_system, load_grid
 from rl2grid.mdp.actions import DO_NOTHING, ActionCatalogue, ActionKind, StepAction, full_catalogue, one_change
 from rl2grid.mdp.heuristics import is_safe, recovery_action
 from rl2grid.powerflow.batch import Snapshot
-from rl2grid.records.files import make_folder
+from rl2grid.records.files import make_folder, set_aside, write_bytes
 from rl2grid.scenarios.episodes import plan_episode
 from rl2grid.scenarios.library import draw_scenario, scenario_pack_hash
 from rl2grid.scenarios.splits import TRAIN
@@ -156,7 +160,8 @@ def run_ranking(
         The file written.
 
     Raises:
-        UsageError: no such grid or sampling, a number that is too small, or an output folder that cannot be made.
+        UsageError: no such grid or sampling, a number that is too small, or an output folder that cannot be made,
+            or that holds a ranking of this grid that was made in another way.
     """
     grid = load_grid(grid_id)
     if states < 2:
@@ -166,6 +171,8 @@ def run_ranking(
     if sampling not in SAMPLINGS:
         raise one_of("Sampling", sampling, SAMPLINGS)
     output = output or Path("rankings")
+    command = f"rl2grid rank {grid_id} --states {states} --seed {seed} --sampling {sampling}"
+    _refuse_another(_ranking_file(output, grid_id), command)
     make_folder(output)
     pack = scenario_pack_hash(grid_id, "train")
     folder = _work_folder(grid, work, f"{pack} {states} {seed} {sampling}")
@@ -179,7 +186,7 @@ def run_ranking(
     order = rank(trials, scores, shape)
     metadata = {
         "version": VERSION,
-        "command": f"rl2grid rank {grid_id} --states {states} --seed {seed} --sampling {sampling}",
+        "command": command,
         "grid": grid_id,
         "grid_hash": grid.hash,
         "split": "train",
@@ -366,7 +373,7 @@ class _Episode(NamedTuple):
 def _episode(laboratory: _Laboratory, seed: int, number: int, folder: Path) -> _Episode:
     """One episode, from the saved file if there is one."""
     file = folder / f"episode_{number:04d}.npz"
-    if not file.exists():
+    if not _is_sound(file):
         played = _play(laboratory, seed, number)
         arrays = {name: np.array([getattr(point, name) for point in played.points]) for name in Snapshot._fields}
         _save(file, kinds=np.array(played.kinds, dtype="U8"), met=played.met, tripped=played.tripped, **arrays)
@@ -374,6 +381,20 @@ def _episode(laboratory: _Laboratory, seed: int, number: int, folder: Path) -> _
         kinds, met, tripped = arrays["kinds"].tolist(), arrays["met"], arrays["tripped"]
         columns = [arrays[name] for name in Snapshot._fields]
     return _Episode(kinds, [Snapshot(*(column[k] for column in columns)) for k in range(len(kinds))], met, tripped)
+
+
+def _is_sound(file: Path) -> bool:
+    """Whether an intermediate result is there; a damaged one is set aside, to be made again."""
+    if not file.exists():
+        return False
+    try:
+        with zipfile.ZipFile(file) as archive:  # which has a checksum of every array
+            sound = archive.testzip() is None
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError):
+        sound = False
+    if not sound:
+        set_aside(file, f"{file} was damaged and is made again")
+    return sound
 
 
 def _play(laboratory: _Laboratory, seed: int, number: int) -> _Episode:
@@ -482,7 +503,7 @@ def _try(
     base = np.zeros(len(points))
     for k, point in enumerate(points):
         file = folder / f"trials_{k:04d}.npz"
-        if not file.exists():
+        if not _is_sound(file):
             ids = _to_be_tried(n_actions, seed, k, sampling)
             row = np.full(n_actions, np.nan, np.float32)
             row[ids] = laboratory.loadings(point, ids)
@@ -522,8 +543,26 @@ def _work_folder(grid: Grid, work: Path | None, request: str) -> Path:
     return folder
 
 
+def _ranking_file(folder: Path, grid_id: str) -> Path:
+    return folder / f"{grid_id}.ranking.npz"
+
+
+def _refuse_another(file: Path, command: str) -> None:
+    """Refuse to replace a ranking that was made in another way."""
+    if not file.exists():
+        return
+    made_by = None
+    damage = (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error)
+    with contextlib.suppress(*damage), np.load(file) as arrays:
+        made_by = json.loads(str(arrays["metadata"])).get("command")
+    if made_by != command:
+        raise UsageError(
+            f"{file} exists already, made by {made_by or 'something else'!r}: choose another folder with --output."
+        )
+
+
 def _write(folder: Path, grid_id: str, ids: I32, scores: Scores, metadata: dict[str, Any]) -> Path:
-    file = folder / f"{grid_id}.ranking.npz"
+    file = _ranking_file(folder, grid_id)
     _save(
         file,
         ids=ids,
@@ -537,10 +576,9 @@ def _write(folder: Path, grid_id: str, ids: I32, scores: Scores, metadata: dict[
 
 def _save(file: Path, **arrays: Any) -> None:
     """Write all or nothing."""
-    temporary = file.with_suffix(f".{os.getpid()}.tmp")
-    with temporary.open("wb") as stream:
-        np.savez_compressed(stream, **arrays)
-    os.replace(temporary, file)
+    content = io.BytesIO()
+    np.savez_compressed(content, **arrays)
+    write_bytes(file, content.getvalue())
 
 
 def _progress(grid_id: str, shown: bool) -> Progress:

@@ -16,7 +16,7 @@ import gymnasium
 import numpy as np
 
 from rl2grid.agents.agent import Action, Agent, Info
-from rl2grid.envs.options import TaskOptions
+from rl2grid.envs.options import TaskOptions, changed_options
 from rl2grid.envs.registration import register_all
 from rl2grid.envs.tasks import Task
 from rl2grid.errors import UsageError
@@ -37,7 +37,7 @@ _KEYWORDS = tuple(field.name for field in fields(TaskOptions) if field.name not 
 def environment(task: Task, keywords: Mapping[str, Any]) -> Iterator[gymnasium.Env[Any, Any]]:
     """An environment to play episodes again in, closed at the end."""
     register_all()
-    env: gymnasium.Env[Any, Any] = gymnasium.make(task.id, disable_env_checker=True, **keywords)
+    env: gymnasium.Env[Any, Any] = gymnasium.make(task.id, disable_env_checker=True, **changed_options(keywords))
     try:
         yield env
     finally:

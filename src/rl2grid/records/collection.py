@@ -18,14 +18,13 @@ from typing import Any
 from rl2grid.errors import UsageError
 from rl2grid.records.evaluations import Evaluation, is_evaluation, load_evaluation
 from rl2grid.records.studies import (
-    CELL_FILE,
     CELLS_FOLDER,
     EVALUATION_FOLDER,
     RUN_FOLDER,
     STUDY_FILE,
     is_cell_finished,
     read_cell,
-    read_json,
+    read_study,
 )
 from rl2grid.records.trainings import TrainingRun, is_run, read_training_run
 from rl2grid.scenarios.splits import VALIDATION
@@ -135,12 +134,14 @@ def _study_folder(folder: Path) -> Path | None:
 
 def _add_study(collection: Collection, folder: Path, split: str | None) -> None:
     taken = 0
-    for entry in read_json(folder / STUDY_FILE)["cells"]:
+    for entry in (read_study(folder) or {"cells": []})["cells"]:
         place = folder / CELLS_FOLDER / entry["cell"]
         if not is_cell_finished(place):
             collection.missing.append(f"Cell {place.name} of the study {folder} is not finished.")
             continue
-        cell = read_json(place / CELL_FILE)
+        cell = read_cell(place)
+        if cell is None or cell["name"] != place.name:
+            raise UsageError(f"{place} does not hold the cell {place.name}: run the study again with the same command.")
         played = cell["split"]
         if split not in (None, played):
             collection.missing.append(

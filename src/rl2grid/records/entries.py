@@ -21,11 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rl2grid.errors import UsageError
-from rl2grid.records.episodes import FACTS, Episode
+from rl2grid.records.episodes import FACTS, Episode, check_values
 from rl2grid.records.evaluations import Evaluation, identity_hash, labels
-from rl2grid.records.files import write_json
+from rl2grid.records.files import printable, read_json, write_record
 
 FORMAT, VERSION = "rl2grid leaderboard entry", 1
+_REMEDY = "give files that 'rl2grid leaderboard entry' wrote, or a ledger of test results as --ledger"
 MAX_BYTES = 500_000_000
 """Of the unpacked actions of one episode: a file that claims more is no entry."""
 
@@ -106,7 +107,7 @@ def write_entry(path: Path, entry: PlayableEntry) -> None:
         "training": entry.training,
         "episodes": [_stored(one) for one in entry.episodes],
     }
-    write_json(path, contents, indent=1)
+    write_record(path, contents, indent=1)
 
 
 def read_entry(path: Path) -> PlayableEntry:
@@ -115,24 +116,16 @@ def read_entry(path: Path) -> PlayableEntry:
     Raises:
         UsageError: the file is no entry, one of another version, or was changed.
     """
-    try:
-        contents = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UsageError(f"{path} cannot be read as an entry of a leaderboard: {error.strerror}.") from None
-    except ValueError:  # neither text nor JSON
-        contents = None
+    contents = read_json(path, "an entry of a leaderboard", _REMEDY)
     if not isinstance(contents, dict) or contents.get("format") != FORMAT:
-        raise UsageError(
-            f"{path} is no entry of a leaderboard: give files that 'rl2grid leaderboard entry' wrote, or a ledger of "
-            "test results as --ledger."
-        )
+        raise UsageError(f"{path} is no entry of a leaderboard: {_REMEDY}.")
     if contents.get("version") != VERSION:
         raise UsageError(
             f"{path} is an entry of version {contents.get('version')!r}: this rl2grid reads version {VERSION}."
         )
     try:
         return _parse(path, contents)
-    except (KeyError, TypeError, ValueError, zlib.error) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError, MemoryError, zlib.error) as error:
         if isinstance(error, UsageError):
             raise
         raise UsageError(f"{path} is a damaged entry of a leaderboard: {error!r}.") from None
@@ -155,7 +148,9 @@ def _parse(path: Path, contents: Mapping[str, Any]) -> PlayableEntry:
     keys = {(one.episode.scenario, one.episode.seed, one.episode.start) for one in episodes}
     if len(keys) != len(episodes):
         raise UsageError(f"{path} was changed: it has an episode twice.")
-    entry = PlayableEntry(str(contents["label"]), identity, str(contents["command"]), contents["training"], episodes)
+    entry = PlayableEntry(
+        printable(str(contents["label"])), identity, str(contents["command"]), contents["training"], episodes
+    )
     _ = entry.evaluation.summary  # refuses what is no table of scenarios and seeds
     return entry
 
@@ -172,6 +167,10 @@ def _episode(path: Path, stored: Mapping[str, Any]) -> PlayedActions:
         value, allowed = facts[column.name], _ALLOWED[column.type]
         if not isinstance(value, allowed) or (isinstance(value, bool) and bool not in allowed):
             raise UsageError(f"{path} is a damaged entry of a leaderboard: {column.name} is {value!r}.")
+    try:
+        check_values(facts)
+    except ValueError as error:
+        raise UsageError(f"{path} is a damaged entry of a leaderboard: {error}.") from None
     foresight = stored.get("foresight", 0)
     if type(foresight) is not int or foresight < 0:
         raise UsageError(f"{path} is a damaged entry of a leaderboard: foresight is {foresight!r}.")

@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import csv
 import io
-import os
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from enum import StrEnum
 from pathlib import Path
 from typing import Any, NamedTuple, get_type_hints
 
 from rl2grid.errors import UsageError
+from rl2grid.records.files import printable, read_text, write_text
 
 EPISODES_FILE = "episodes.csv"
 
@@ -43,10 +44,25 @@ class Column(NamedTuple):
     """Empty where there is none."""
     meaning: str
     origin: Origin
+    least: float = -math.inf
+    """Smallest value of a number."""
+    most: float = math.inf
+    """Largest value of a number."""
 
 
-def _fact(meaning: str, unit: str = "", origin: Origin = Origin.EPISODE) -> Any:
-    return field(metadata={"meaning": meaning, "unit": unit, "origin": origin})
+def _fact(
+    meaning: str,
+    unit: str = "",
+    origin: Origin = Origin.EPISODE,
+    *,
+    least: float = -math.inf,
+    most: float = math.inf,
+) -> Any:
+    return field(metadata={"meaning": meaning, "unit": unit, "origin": origin, "least": least, "most": most})
+
+
+def _count(meaning: str, unit: str = "", least: int = 0) -> Any:
+    return _fact(meaning, unit, least=least, most=2**63)
 
 
 def _label(meaning: str) -> Any:
@@ -65,12 +81,12 @@ class Episode:
     heuristic: str = _label("`none`, `idle`, `recovery` or `careful`")
     split: str = _label("split of the month")
     scenario: str = _fact("the month")
-    seed: int = _fact("of maintenance, opponent and agent, together with the month")
-    start: int = _fact("row of the scenario at which the episode begins")
-    episode_length: int = _fact("steps of a completed episode, T", "grid steps")
-    grid_steps: int = _fact("steps played, heuristic steps and the step of a game over included", "grid steps")
-    decisions: int = _fact("actions asked of the agent; 0 when the episode ended before its first decision")
-    survival: float = _fact("share of the episode survived, 0 to 1")
+    seed: int = _count("of maintenance, opponent and agent, together with the month")
+    start: int = _count("row of the scenario at which the episode begins")
+    episode_length: int = _count("steps of a completed episode, T", "grid steps", least=1)
+    grid_steps: int = _count("steps played, heuristic steps and the step of a game over included", "grid steps")
+    decisions: int = _count("actions asked of the agent; 0 when the episode ended before its first decision")
+    survival: float = _fact("share of the episode survived, 0 to 1", least=0.0, most=1.0)
     completed: bool = _fact("whether the last step was reached without a game over")
     game_over: str = _fact("reason of the game over; `NONE` when completed")
     last_overloads: str = _fact("lines above their limit in the state before the game over", "ids")
@@ -90,14 +106,15 @@ class Episode:
     score_margin: float = _fact("margin score of the paper (Section 5), mean per step")
     score_overload: float = _fact("its overload score")
     score_topology: float = _fact("its topology score")
-    illegal: int = _fact("actions of the agent that broke a rule")
-    ambiguous: int = _fact("actions of the agent that contradicted themselves")
+    illegal: int = _count("actions of the agent that broke a rule")
+    ambiguous: int = _count("actions of the agent that contradicted themselves")
     foresight: int = field(
         default=0,
         metadata={
             "meaning": "decisions taken where the true future had been seen, by stepping a saved true world",
             "unit": "",
             "origin": Origin.AGENT,
+            "least": 0.0,
         },
     )
     wall_time_s: float = _fact("time that the episode took", "s", Origin.CLOCK)
@@ -110,7 +127,11 @@ class Episode:
 
 _TYPES: dict[str, type] = get_type_hints(Episode)
 COLUMNS: tuple[Column, ...] = tuple(
-    Column(each.name, _TYPES[each.name], each.metadata["unit"], each.metadata["meaning"], each.metadata["origin"])
+    Column(
+        each.name,
+        _TYPES[each.name],
+        **{key: each.metadata[key] for key in ("unit", "meaning", "origin", "least", "most") if key in each.metadata},
+    )
     for each in fields(Episode)
 )
 """In the order of the files."""
@@ -123,10 +144,7 @@ FACTS: tuple[Column, ...] = tuple(column for column in COLUMNS if column.origin 
 
 def write_episodes(path: Path, episodes: Iterable[Episode]) -> None:
     """Write a file of episodes, whole or not at all."""
-    text = ",".join(COLUMN_NAMES) + "\n" + "".join(map(format_row, episodes))
-    temporary = path.with_name(f"{path.name}.tmp")
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, path)
+    write_text(path, ",".join(COLUMN_NAMES) + "\n" + "".join(map(format_row, episodes)))
 
 
 def read_episodes(path: Path) -> tuple[Episode, ...]:
@@ -135,14 +153,39 @@ def read_episodes(path: Path) -> tuple[Episode, ...]:
     Raises:
         UsageError: the file is missing or no file of episodes.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path} cannot be read as a file of episodes: {error}.") from None
-    rows = list(csv.reader(io.StringIO(text[: text.rfind("\n") + 1])))
-    if not rows or tuple(rows[0]) != COLUMN_NAMES:
+    text = read_text(path, "a file of episodes", "give it as 'rl2grid evaluate' wrote it")
+    head, _, body = text[: text.rfind("\n") + 1].partition("\n")
+    if tuple(head.split(",")) != COLUMN_NAMES:
         raise UsageError(f"{path} is no file of episodes: its first line must be {','.join(COLUMN_NAMES)}.")
-    return tuple(_parse_row(path, number, row) for number, row in enumerate(rows[1:], start=2))
+    return parse_episodes(path, body.split("\n")[:-1])
+
+
+def parse_episodes(path: Path, lines: Sequence[str]) -> tuple[Episode, ...]:
+    """The episodes of the lines of a file, which follow its first.
+
+    Raises:
+        UsageError: one is no episode.
+    """
+    try:
+        rows = list(csv.reader(lines, strict=True))
+    except csv.Error as error:
+        raise UsageError(f"{path} is no file of episodes: {error}.") from None
+    return tuple(_parse_row(path, number, row) for number, row in enumerate(rows, start=2))
+
+
+def check_values(values: Mapping[str, Any]) -> None:
+    """Refuse values of an episode that no episode has.
+
+    Raises:
+        ValueError: which one.
+    """
+    for column in COLUMNS:
+        value = values.get(column.name)
+        if not isinstance(value, int | float) or isinstance(value, bool):
+            continue
+        if not math.isfinite(value) or value < column.least or value > column.most:
+            allowed = f"from {column.least:g} to {column.most:g}" if math.isfinite(column.least) else "a finite number"
+            raise ValueError(f"{column.name} is {value!r}, and must be {allowed}")
 
 
 def format_row(episode: Episode) -> str:
@@ -158,7 +201,10 @@ def _format(value: Any) -> Any:
 
 def _parse_row(path: Path, number: int, row: list[str]) -> Episode:
     try:
+        if len(row) != len(COLUMNS):
+            raise ValueError(f"it has {len(row)} values, and must have {len(COLUMNS)}")
         values = {column.name: _parse(column.type, text) for column, text in zip(COLUMNS, row, strict=True)}
+        check_values(values)
     except ValueError as error:
         raise UsageError(f"Line {number} of {path} is no episode: {error}.") from None
     return Episode(**values)
@@ -169,4 +215,4 @@ def _parse(kind: type, text: str) -> Any:
         if text not in ("true", "false"):
             raise ValueError(f"expected true or false, got {text!r}")
         return text == "true"
-    return kind(text)
+    return printable(text) if kind is str else kind(text)

@@ -17,13 +17,26 @@ from typing import Any
 from filelock import BaseFileLock
 
 from rl2grid.errors import UsageError
-from rl2grid.records.episodes import EPISODES_FILE, Episode, format_row, read_episodes, write_episodes
-from rl2grid.records.evaluations import EVALUATION_FILE, read_request, write_evaluation
-from rl2grid.records.files import check_folder, make_folder
+from rl2grid.records.episodes import COLUMN_NAMES, EPISODES_FILE, Episode, format_row, parse_episodes, write_episodes
+from rl2grid.records.evaluations import EVALUATION_FILE, is_complete, read_finished, read_request, write_evaluation
+from rl2grid.records.files import (
+    CHECKSUM,
+    check_folder,
+    check_own,
+    make_folder,
+    opened_line,
+    read_text,
+    sealed_line,
+    set_aside,
+    write_text,
+)
 from rl2grid.records.locks import LockedError, take_lock
 from rl2grid.records.summary import Summary, summarise
 
 PARTIAL_FILE = "episodes.partial.csv"
+
+
+_PARTIAL_HEADER = ",".join((*COLUMN_NAMES, CHECKSUM))
 
 
 class Store:
@@ -52,8 +65,7 @@ class FolderStore(Store):
         if not folder.exists():
             check_folder(folder)
             return
-        if not folder.is_dir():
-            raise UsageError(f"{folder} is a file: give a folder to store the evaluation in.")
+        check_own(folder, (EVALUATION_FILE,), "evaluation")
         self._take_lock()
         try:
             self.episodes = self._stored_episodes()
@@ -68,9 +80,9 @@ class FolderStore(Store):
             self._check_still_unused()
         if not self._partial.exists():
             self._describe(None)
-            write_episodes(self._partial, self.episodes)
+            self._begin_partial()
         with self._partial.open("a", encoding="utf-8", newline="") as file:
-            file.write(format_row(episode))
+            file.write(_sealed_row(episode))
 
     def finish(self, episodes: tuple[Episode, ...]) -> None:
         write_episodes(self._finished, episodes)
@@ -85,14 +97,30 @@ class FolderStore(Store):
         if not (self._folder / EVALUATION_FILE).exists():
             return ()
         _check_same_request(self._folder, self._request)
-        if self._finished.exists():
-            return read_episodes(self._finished)
+        # A kill may have come between the rows and the description that vouches for them.
+        if self._finished.exists() and is_complete(self._folder):
+            return read_finished(self._folder)
         if not self._partial.exists():
             return ()
-        episodes = read_episodes(self._partial)
+        self.episodes = self._partial_episodes()
         # Without the torn line that a kill may have left at the end.
-        write_episodes(self._partial, episodes)
-        return episodes
+        self._begin_partial()
+        return self.episodes
+
+    def _partial_episodes(self) -> tuple[Episode, ...]:
+        """The rows that are whole and of this evaluation; others are played again."""
+        text = read_text(self._partial, "a file of episodes", "remove it, and they are played again")
+        head, *lines = text[: text.rfind("\n") + 1].splitlines() or [""]
+        rows = [opened_line(line) for line in lines] if head == _PARTIAL_HEADER else [None]
+        whole = parse_episodes(self._partial, [row for row in rows if row is not None])
+        own = tuple(row for row in whole if row.identity == self._request.get("identity_hash", row.identity))
+        if len(own) < len(rows):
+            words = f"{len(own)} of its rows are whole and of this evaluation, others are played again"
+            set_aside(self._partial, f"{self._partial} was damaged: {words}")
+        return own
+
+    def _begin_partial(self) -> None:
+        write_text(self._partial, f"{_PARTIAL_HEADER}\n{''.join(map(_sealed_row, self.episodes))}")
 
     def _check_still_unused(self) -> None:
         """Refuse what another process wrote since this evaluation began, when there was no folder."""
@@ -113,6 +141,10 @@ class FolderStore(Store):
             raise UsageError(
                 f"Another process is writing to {self._folder}: wait for it, or choose another folder."
             ) from None
+
+
+def _sealed_row(episode: Episode) -> str:
+    return sealed_line(format_row(episode).removesuffix("\n")) + "\n"
 
 
 def _check_same_request(folder: Path, request: Mapping[str, Any]) -> None:

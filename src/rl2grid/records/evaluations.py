@@ -10,15 +10,24 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from types import NoneType
 from typing import Any
 
 from rl2grid.errors import UsageError
 from rl2grid.records.episodes import EPISODES_FILE, Episode, read_episodes
-from rl2grid.records.files import write_json
+from rl2grid.records.files import read_json, write_record
 from rl2grid.records.statistics import Estimate
 from rl2grid.records.summary import Summary, summarise
 
 EVALUATION_FILE = "evaluation.json"
+_ROWS_HASH = "episodes_sha256"
+_DESCRIPTION = {
+    "identity": {"task": str, "agent": str, "heuristic": (str, NoneType), "split": str},
+    "command": str,
+    "jobs": list,
+    "complete": bool,
+    "summary": (dict, NoneType),
+}
 
 
 @dataclass(frozen=True)
@@ -67,9 +76,17 @@ def labels(identity: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def write_evaluation(path: Path, request: Mapping[str, Any], summary: Summary | None) -> None:
-    """Write the description of an evaluation, with its aggregates once it is complete."""
-    figures = None if summary is None else {name: _plain(value) for name, value in vars(summary).items()}
-    write_json(path, {**request, "complete": summary is not None, "summary": figures})
+    """Write the description of an evaluation; once it is complete, with its aggregates and the hash of its rows."""
+    record = {**request, "complete": summary is not None, "summary": None}
+    if summary is not None:
+        record["summary"] = {name: _plain(value) for name, value in vars(summary).items()}
+        rows = path.with_name(EPISODES_FILE)
+        record[_ROWS_HASH] = _file_hash(rows) if rows.is_file() else None
+    write_record(path, record)
+
+
+def _file_hash(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _plain(value: Any) -> Any:
@@ -85,12 +102,19 @@ def read_request(path: Path) -> dict[str, Any]:
     Raises:
         UsageError: the file is no description of an evaluation.
     """
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-        del record["complete"], record["summary"]
-        return dict(record)
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UsageError(f"{path} is no description of an evaluation: {error!r}.") from None
+    record = _read_description(path)
+    for name in ("complete", "summary", _ROWS_HASH):
+        record.pop(name, None)
+    return record
+
+
+def _read_description(path: Path) -> dict[str, Any]:
+    remedy = "give a folder as 'rl2grid evaluate' wrote it"
+    record: dict[str, Any] = read_json(path, "a description of an evaluation", remedy, _DESCRIPTION)
+    stated = record.get("identity_hash")
+    if stated not in (None, identity_hash(record["identity"])):
+        raise UsageError(f"{path} was changed: its identity does not have the hash {stated!r}; {remedy}.")
+    return record
 
 
 def is_evaluation(folder: Path) -> bool:
@@ -109,7 +133,32 @@ def load_evaluation(folder: Path) -> Evaluation:
     request = read_request(folder / EVALUATION_FILE)
     if not (folder / EPISODES_FILE).is_file():
         raise UsageError(f"The evaluation in {folder} is unfinished: continue it with {_continuing(request, folder)}.")
-    return Evaluation(read_episodes(folder / EPISODES_FILE), request["identity"], request["command"], folder)
+    return Evaluation(read_finished(folder), request["identity"], request["command"], folder)
+
+
+def read_finished(folder: Path) -> tuple[Episode, ...]:
+    """The rows of a finished evaluation.
+
+    Raises:
+        UsageError: they are not those that its description was written for.
+    """
+    path, stated = folder / EPISODES_FILE, _read_description(folder / EVALUATION_FILE).get(_ROWS_HASH)
+    episodes = read_episodes(path)
+    if stated not in (None, _file_hash(path)):
+        raise UsageError(
+            f"{path} was changed since it was written, or belongs to another evaluation: restore it, or remove the "
+            "folder and evaluate again."
+        )
+    return episodes
+
+
+def is_complete(folder: Path) -> bool:
+    """Whether an evaluation was finished, as its description says.
+
+    Raises:
+        UsageError: the folder holds none.
+    """
+    return bool(_read_description(folder / EVALUATION_FILE)["complete"])
 
 
 def _continuing(request: Mapping[str, Any], folder: Path) -> str:

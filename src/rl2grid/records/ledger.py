@@ -9,19 +9,26 @@ is an entry of a leaderboard, :mod:`rl2grid.records.entries`. What the order say
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from rl2grid.errors import UsageError
 from rl2grid.records.evaluations import Evaluation, identity_hash
-from rl2grid.records.files import write_json
+from rl2grid.records.files import CHECKSUM, checksum, misfit, not_what, read_json, write_json
 from rl2grid.records.month_values import pack_months
 from rl2grid.records.statistics import Estimate
 
+_REMEDY = "give a file that 'rl2grid leaderboard test' wrote, or one that does not exist yet"
+_TEST = {
+    "configuration": {"task": str},
+    "training": dict,
+    "identity_hash": str,
+    "episodes_hash": str,
+    "test": {"episodes": int},
+    "months": dict,
+}
 _FIGURES = ("survival", "completed", "cost_lsi", "cost_tlo", "safe_lsi", "safe_tlo", "decisions")
 
 
@@ -48,6 +55,8 @@ class HashedTest:
     """What every month came to, see :mod:`rl2grid.records.month_values`; empty for results on the first test list."""
     last: Mapping[str, str] = field(default_factory=dict)
     """The same of the run's last policy; empty where that is the best one, or nothing was trained."""
+    checksum: str = field(default="", compare=False)
+    """Of all else; empty for results that were entered before there was one."""
 
     @property
     def task(self) -> str:
@@ -100,7 +109,7 @@ def hashed_test(
     rows = [[row.scenario, row.seed, row.grid_steps, row.decisions, row.episode_return] for row in evaluation.episodes]
     summary, identity = evaluation.summary, evaluation.identity
     figures = {name: _interval(getattr(summary, name)) for name in _FIGURES}
-    return HashedTest(
+    made = HashedTest(
         configuration=dict(configuration),
         training=dict(training),
         identity_hash=identity_hash(identity),
@@ -116,6 +125,7 @@ def hashed_test(
         values=pack_months(evaluation.episodes),
         last={} if last is None else pack_months(last.episodes),
     )
+    return replace(made, checksum=_checksum(made))
 
 
 def read_ledger(path: Path) -> dict[str, HashedTest]:
@@ -126,22 +136,39 @@ def read_ledger(path: Path) -> dict[str, HashedTest]:
     """
     if not path.exists():
         return {}
+    stored = read_json(path, "a ledger of test results", _REMEDY, dict)
+    return {digest: _read_test(path, digest, result) for digest, result in stored.items()}
+
+
+def _read_test(path: Path, digest: str, stored: Any) -> HashedTest:
+    complaint = misfit(stored, _TEST, digest)
+    if complaint:
+        raise not_what(path, "a ledger of test results", complaint, _REMEDY)
     try:
-        stored = json.loads(path.read_text(encoding="utf-8"))
-        return {digest: HashedTest(**result) for digest, result in stored.items()}
-    except OSError as error:
-        raise UsageError(f"{path} cannot be read as a ledger of test results: {error.strerror}.") from None
-    except (ValueError, TypeError, AttributeError):
-        raise UsageError(
-            f"{path} is no ledger of test results: give a file that 'rl2grid leaderboard test' wrote, or one that "
-            "does not exist yet."
-        ) from None
+        result = HashedTest(**stored)
+    except TypeError as error:
+        raise not_what(path, "a ledger of test results", f"{digest} has other entries ({error})", _REMEDY) from None
+    if digest != identity_hash(result.configuration) or result.checksum not in ("", _checksum(result)):
+        raise not_what(path, "a ledger of test results", f"the result {digest} was changed", _REMEDY)
+    return result
+
+
+def _checksum(result: HashedTest) -> str:
+    return checksum(_stored(replace(result, checksum="")))
+
+
+def _stored(result: HashedTest) -> dict[str, Any]:
+    """A result as it stands in a ledger."""
+    entries = asdict(result)
+    if not result.checksum:
+        del entries[CHECKSUM]
+    return entries
 
 
 def add_test(path: Path, result: HashedTest) -> None:
     """Add a result to a ledger, or replace that of its configuration."""
     results = {**read_ledger(path), identity_hash(result.configuration): result}
-    write_json(path, {digest: asdict(one) for digest, one in results.items()}, indent=1)
+    write_json(path, {digest: _stored(one) for digest, one in results.items()}, indent=1)
 
 
 def _interval(estimate: Estimate) -> list[float | None]:

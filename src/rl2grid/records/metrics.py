@@ -2,17 +2,20 @@
 
 ::
 
-    step,grid_steps,wall_time,name,value
+    step,grid_steps,wall_time,name,value,checksum
 
-which ``pandas.read_csv(path).pivot(index="step", columns="name", values="value")`` turns into one column per metric.
+of which the last is that of the row (:func:`rl2grid.records.files.sealed_line`). It decorates: what is damaged is set
+aside, and the run goes on.
+``pandas.read_csv(path).pivot(index="step", columns="name", values="value")`` makes one column per metric.
 """
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+
+from rl2grid.errors import UsageError
+from rl2grid.records.files import CHECKSUM, not_what, opened_line, read_text, sealed_line, set_aside, write_text
 
 METRICS_FILE = "metrics.csv"
 METRIC_COLUMNS = ("step", "grid_steps", "wall_time", "name", "value")
@@ -20,6 +23,7 @@ METRIC_COLUMNS = ("step", "grid_steps", "wall_time", "name", "value")
 SURVIVAL, VALIDATION = "charts/survival", "validation/survival"
 """Names of the metrics: mean over the episodes that ended in an iteration, and on the validation scenarios."""
 EPISODES = "charts/episodes"
+_WHAT, _REMEDY = "a metrics file", "resuming the run sets it aside, and keeps what is sound"
 
 
 class MetricsFile:
@@ -35,12 +39,12 @@ class MetricsFile:
         path = folder / METRICS_FILE
         _keep_rows_until(path, after_step)
         self._file = path.open("a", encoding="utf-8", newline="")
-        self._csv = csv.writer(self._file, lineterminator="\n")
 
     def write(self, step: int, grid_steps: int, wall_time: float, values: Mapping[str, float]) -> None:
         """Append the values of one step, complete on disk when this returns."""
         for name, value in values.items():
-            self._csv.writerow((step, grid_steps, f"{wall_time:.3f}", name, repr(float(value))))
+            row = f"{step},{grid_steps},{wall_time:.3f},{name},{float(value)!r}"
+            self._file.write(sealed_line(row) + "\n")
         self._file.flush()
 
     def close(self) -> None:
@@ -74,19 +78,45 @@ class MetricsTail:
             return
         self._offset, self._last = self._offset + sum(map(len, lines)), lines[-1]
         for line in lines:
-            match line.decode("utf-8").rstrip("\n").split(","):
-                case ["step", *_]:
-                    continue
-                case [step, _, _, name, value]:
-                    self.decisions = int(step)
-                    if name == VALIDATION:
-                        self.best = max(float(value), self.best or 0.0)
+            row = _row(line.decode("utf-8", errors="replace").rstrip("\n"))
+            if row is None:  # the header, or damaged: what follows says how far the run is
+                continue
+            self.decisions = int(row["step"])
+            if row["name"] == VALIDATION:
+                self.best = max(float(row["value"]), self.best or 0.0)
 
 
 def read_rows(path: Path) -> Iterator[dict[str, str]]:
-    """The rows of a metrics file. A last line without its end, as a killed writer leaves it, is ignored."""
-    text = path.read_text(encoding="utf-8")
-    return csv.DictReader(io.StringIO(text[: text.rfind("\n") + 1]))
+    """The rows of a metrics file. A last line without its end, as a killed writer leaves it, is ignored.
+
+    Raises:
+        UsageError: it is no metrics file, or one of its rows was changed.
+    """
+    text = read_text(path, _WHAT, _REMEDY)
+    head, *lines = text[: text.rfind("\n") + 1].splitlines() or [""]
+    if tuple(head.split(",")[: len(METRIC_COLUMNS)]) != METRIC_COLUMNS:
+        raise UsageError(f"{path} is no metrics file of a training run: give a run folder or its metrics.csv.")
+    for number, line in enumerate(lines, start=2):
+        row = _row(line)
+        if row is None:
+            raise not_what(path, _WHAT, f"line {number} was changed", _REMEDY)
+        yield row
+
+
+def _row(line: str) -> dict[str, str] | None:
+    """The values of a line by column; None: it is the header, or was changed."""
+    values = line.split(",")
+    if len(values) > len(METRIC_COLUMNS):
+        opened = opened_line(line)
+        values = [] if opened is None else opened.split(",")
+    if len(values) != len(METRIC_COLUMNS):
+        return None
+    row = dict(zip(METRIC_COLUMNS, values, strict=True))
+    try:
+        _ = int(row["step"]), float(row["grid_steps"]), float(row["wall_time"]), float(row["value"])
+    except ValueError:
+        return None
+    return row
 
 
 def read_validations(folder: Path) -> dict[int, dict[str, float]]:
@@ -110,20 +140,32 @@ def trained_seconds(run: Path) -> float:
     path = run / METRICS_FILE
     if not path.exists():
         return 0.0
-    last = path.read_text(encoding="utf-8").strip().splitlines()[-1].split(",")
-    return float(last[2]) if last[2] != "wall_time" else 0.0
+    rows = map(_row, path.read_text(encoding="utf-8", errors="replace").splitlines())
+    return max((float(row["wall_time"]) for row in rows if row is not None), default=0.0)
 
 
 def _keep_rows_until(path: Path, step: int) -> None:
-    """Cut the file behind its last complete row of a step up to ``step``; make it, with its header, if need be."""
-    header = ",".join(METRIC_COLUMNS) + "\n"
+    """Cut the file behind its last complete row of a step up to ``step``; make it, with its header, if need be.
+
+    A damaged file is set aside; what is sound of it is kept.
+    """
+    header = ",".join((*METRIC_COLUMNS, CHECKSUM)) + "\n"
     if not path.exists() or path.stat().st_size < len(header):
-        path.write_text(header, encoding="utf-8", newline="\n")
+        write_text(path, header)
         return
-    with open(path, "rb+") as file:
-        end = len(file.readline())
-        for row in file:
-            if not row.endswith(b"\n") or int(row.split(b",", 1)[0]) > step:
-                break
-            end += len(row)
-        file.truncate(end)
+    try:
+        head, *lines = path.read_bytes().decode("utf-8", errors="replace").splitlines(keepends=True)
+    except MemoryError:
+        head, lines = "", []
+    kept, damaged = [header], head != header
+    for line in lines:
+        row = _row(line.removesuffix("\n"))
+        if row is not None and int(row["step"]) > step:
+            break
+        if row is None and not line.endswith("\n") and line is lines[-1]:
+            break  # a kill cut it short
+        damaged |= row is None or not line.endswith("\n")
+        kept += [] if row is None else [line]
+    if damaged:
+        set_aside(path, f"{path} was damaged: {len(kept) - 1} of its rows are kept")
+    write_text(path, "".join(kept))

@@ -10,13 +10,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
-from rl2grid.records.files import write_json
+from rl2grid.records.files import read_json, write_record
 from rl2grid.records.locks import locked
 
 SEARCH_FILE, BEST_FILE = "tuning.json", "best.json"
@@ -29,18 +28,19 @@ def read_search(folder: Path) -> dict[str, Any] | None:
     path = folder / SEARCH_FILE
     if not path.exists():
         return None
-    search: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    remedy = "restore it, or begin another search in another folder"
+    search: dict[str, Any] = read_json(path, "a description of a search", remedy, {"seeds": list, "task": str})
     return search
 
 
 def write_search(folder: Path, search: Mapping[str, Any]) -> None:
     """Write what is searched."""
-    write_json(folder / SEARCH_FILE, search)
+    write_record(folder / SEARCH_FILE, dict(search))
 
 
 def write_best(folder: Path, best: Mapping[str, Any]) -> None:
     """Write the best configuration and the command that trains with it."""
-    write_json(folder / BEST_FILE, best)
+    write_record(folder / BEST_FILE, dict(best))
 
 
 def search_lock(folder: Path) -> AbstractContextManager[None]:

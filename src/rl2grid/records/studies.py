@@ -9,21 +9,32 @@
 
 from __future__ import annotations
 
-import json
-import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import NoneType
 from typing import Any
 
 from rl2grid.errors import UsageError
 from rl2grid.records.episodes import COLUMN_NAMES, EPISODES_FILE, format_row, read_episodes
 from rl2grid.records.evaluation_folder import PARTIAL_FILE
-from rl2grid.records.files import write_json
+from rl2grid.records.evaluations import EVALUATION_FILE, read_request
+from rl2grid.records.files import read_json, write_record, write_text
 
 STUDY_FILE, CELLS_FOLDER = "study.json", "cells"
 CELL_FILE, RESULT_FILE = "cell.json", "result.json"
 RUN_FOLDER, EVALUATION_FOLDER = "run", "evaluation"
+_PART, _REMEDY = "a part of a study", "remove it, and the study makes it again"
+_CELL = {
+    "name": str,
+    "agent": str,
+    "task": str,
+    "heuristic": (str, NoneType),
+    "split": str,
+    "training": (dict, NoneType),
+}
+_RESULT = {"minutes": float, "identity": str, "survival": float, "episodes": int}
+_STUDY = {"cells": [{"cell": str}]}
 
 
 @dataclass(frozen=True)
@@ -46,13 +57,16 @@ def read_cell(folder: Path) -> dict[str, Any] | None:
         UsageError: the file cannot be read.
     """
     path = folder / CELL_FILE
-    return dict(read_json(path)) if path.is_file() else None
+    if not path.is_file():
+        return None
+    cell: dict[str, Any] = read_json(path, _PART, _REMEDY, _CELL)
+    return cell
 
 
 def write_cell(folder: Path, cell: Mapping[str, Any]) -> None:
     """Make the folder of a cell."""
     folder.mkdir(parents=True, exist_ok=True)
-    write_json(folder / CELL_FILE, cell)
+    write_record(folder / CELL_FILE, dict(cell))
 
 
 def is_cell_finished(folder: Path) -> bool:
@@ -61,14 +75,29 @@ def is_cell_finished(folder: Path) -> bool:
 
 
 def read_result(folder: Path) -> CellResult | None:
-    """The result of a finished cell; None if it is not finished."""
+    """The result of a finished cell; None if it is not finished.
+
+    Raises:
+        UsageError: the file cannot be read, or is that of another cell.
+    """
     path = folder / RESULT_FILE
-    return CellResult(**read_json(path)) if path.exists() else None
+    if not path.exists():
+        return None
+    stored = read_json(path, _PART, _REMEDY, _RESULT)
+    result = CellResult(**{name: stored[name] for name in _RESULT})
+    evaluation = folder / EVALUATION_FOLDER / EVALUATION_FILE
+    request = read_request(evaluation) if evaluation.is_file() else {}
+    if "identity_hash" in request and (request["identity_hash"], len(request["jobs"])) != (
+        result.identity,
+        result.episodes,
+    ):
+        raise UsageError(f"{path} belongs to another evaluation than that of its cell: {_REMEDY}.")
+    return result
 
 
 def write_result(folder: Path, result: CellResult) -> None:
     """Write the result of a cell, which is then finished."""
-    write_json(folder / RESULT_FILE, vars(result))
+    write_record(folder / RESULT_FILE, vars(result))
 
 
 def played_episodes(folder: Path) -> int:
@@ -76,7 +105,7 @@ def played_episodes(folder: Path) -> int:
     for name in (EPISODES_FILE, PARTIAL_FILE):
         path = folder / EVALUATION_FOLDER / name
         if path.exists():
-            return max(path.read_text(encoding="utf-8").count("\n") - 1, 0)
+            return max(path.read_bytes().count(b"\n") - 1, 0)
     return 0
 
 
@@ -87,12 +116,15 @@ def read_study(folder: Path) -> dict[str, Any] | None:
         UsageError: the file cannot be read.
     """
     path = folder / STUDY_FILE
-    return dict(read_json(path)) if path.exists() else None
+    if not path.exists():
+        return None
+    study: dict[str, Any] = read_json(path, _PART, _REMEDY, _STUDY)
+    return study
 
 
 def write_study(folder: Path, study: Mapping[str, Any]) -> None:
     """Write what is known of a study."""
-    write_json(folder / STUDY_FILE, study)
+    write_record(folder / STUDY_FILE, dict(study))
 
 
 def write_study_episodes(folder: Path, cells: Iterable[tuple[str, int | None]]) -> None:
@@ -102,23 +134,8 @@ def write_study_episodes(folder: Path, cells: Iterable[tuple[str, int | None]]) 
         folder: of the study.
         cells: name and seed of the training, None without one, of every finished cell.
     """
-    path = folder / EPISODES_FILE
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    with temporary.open("w", encoding="utf-8", newline="") as file:
-        file.write(",".join(("cell", "training_seed", *COLUMN_NAMES)) + "\n")
-        for name, seed in cells:
-            for episode in read_episodes(folder / CELLS_FOLDER / name / EVALUATION_FOLDER / EPISODES_FILE):
-                file.write(f"{name},{'' if seed is None else seed},{format_row(episode)}")
-    os.replace(temporary, path)
-
-
-def read_json(path: Path) -> Any:
-    """A file of a study.
-
-    Raises:
-        UsageError: it cannot be read.
-    """
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise UsageError(f"{path} cannot be read as part of a study: {error}.") from None
+    rows = [",".join(("cell", "training_seed", *COLUMN_NAMES)) + "\n"]
+    for name, seed in cells:
+        for episode in read_episodes(folder / CELLS_FOLDER / name / EVALUATION_FOLDER / EPISODES_FILE):
+            rows.append(f"{name},{'' if seed is None else seed},{format_row(episode)}")
+    write_text(folder / EPISODES_FILE, "".join(rows))

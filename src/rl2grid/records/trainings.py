@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,11 +13,17 @@ import numpy as np
 
 from rl2grid.arrays import F64
 from rl2grid.errors import UsageError
-from rl2grid.records.files import make_folder, write_json
+from rl2grid.records.files import make_folder, read_json, set_aside, write_record
 from rl2grid.records.metrics import EPISODES, METRICS_FILE, SURVIVAL, VALIDATION, read_rows
 
 RUN_FILE, ENERGY_FILE, TRACKING_FILE = "config.json", "energy.json", "wandb.json"
 _COLUMNS = ("step", "grid_steps", "name", "value")
+_CONFIGURATION = {
+    "request": {"task": str, "algorithm": str, "hyperparameters": {"seed": int}, "env_keywords": dict},
+    "identity": dict,
+}
+_FIGURES = {"energy_kwh": float, "co2_kg": float, "cpu_seconds": float, "wall_seconds": float, "method": str}
+_ACCOUNT = {**_FIGURES, "parts": [_FIGURES]}
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,8 +75,15 @@ def is_run(folder: Path) -> bool:
     return (folder / RUN_FILE).is_file()
 
 
-def create_run_folder(folder: Path, configuration: Mapping[str, Any]) -> None:
+def create_run_folder(
+    folder: Path, configuration: Mapping[str, Any], fill: Callable[[Path], None] = lambda folder: None
+) -> None:
     """Make the folder of a run with its configuration: it appears complete or not at all.
+
+    Args:
+        folder: of the run.
+        configuration: what :func:`read_configuration` returns.
+        fill: writes what else belongs into the folder from the beginning.
 
     Raises:
         UsageError: it cannot be made.
@@ -80,7 +92,8 @@ def create_run_folder(folder: Path, configuration: Mapping[str, Any]) -> None:
     temporary = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
     try:
         temporary.mkdir()
-        write_json(temporary / RUN_FILE, configuration)
+        write_record(temporary / RUN_FILE, dict(configuration))
+        fill(temporary)
         os.rename(temporary, folder)
     except OSError as error:
         shutil.rmtree(temporary, ignore_errors=True)
@@ -91,37 +104,46 @@ def read_configuration(folder: Path) -> dict[str, Any]:
     """What :func:`create_run_folder` was given: ``request``, ``identity`` and ``seeds``.
 
     Raises:
-        OSError: there is no such file.
-        ValueError: it is no JSON.
+        UsageError: there is no such file, or it is none.
     """
-    configuration: dict[str, Any] = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
+    configuration: dict[str, Any] = read_json(
+        folder / RUN_FILE, "a description of a run", "give a folder as 'rl2grid train' wrote it", _CONFIGURATION
+    )
     return configuration
 
 
 def read_energy(folder: Path) -> dict[str, Any] | None:
-    """The energy account of a run; None where there is none."""
-    path = folder / ENERGY_FILE
-    if not path.is_file():
-        return None
-    account: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    """The energy account of a run; None where there is none, or one that was damaged and is now set aside."""
+    account: dict[str, Any] | None = _read_decoration(folder / ENERGY_FILE, "an energy account", _ACCOUNT)
     return account
 
 
 def write_energy(folder: Path, account: Mapping[str, Any]) -> None:
     """Write the energy account of a run."""
-    write_json(folder / ENERGY_FILE, account)
+    write_record(folder / ENERGY_FILE, dict(account))
 
 
 def read_tracking(folder: Path) -> str | None:
-    """The id under which a run is tracked; None where it is not."""
-    path = folder / TRACKING_FILE
-    return str(json.loads(path.read_text(encoding="utf-8"))["id"]) if path.exists() else None
+    """The id under which a run is tracked; None where it is not, or as :func:`read_energy`."""
+    tracking = _read_decoration(folder / TRACKING_FILE, "an id of a tracked run", {"id": str})
+    return None if tracking is None else str(tracking["id"])
 
 
 def write_tracking(folder: Path, run_id: str) -> str:
     """Write the id under which a run is tracked, and return it."""
-    write_json(folder / TRACKING_FILE, {"id": run_id}, indent=None)
+    write_record(folder / TRACKING_FILE, {"id": run_id}, indent=None)
     return run_id
+
+
+def _read_decoration(path: Path, what: str, shape: Any) -> Any:
+    """What a file holds without which a run is still the same; None where there is none, or no sound one."""
+    if not path.exists():
+        return None
+    try:
+        return read_json(path, what, "what it said is lost", shape)
+    except UsageError as error:
+        set_aside(path, str(error))
+        return None
 
 
 def read_training_curve(path: Path, label: str) -> TrainingCurve:
@@ -140,7 +162,9 @@ def read_training_curve(path: Path, label: str) -> TrainingCurve:
     try:
         rows = [[row[column] for column in _COLUMNS] for row in read_rows(path)]
         points = [(name, float(step), float(grid_steps), float(value)) for step, grid_steps, name, value in rows]
-    except (OSError, KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError) as error:
+        if isinstance(error, UsageError) and path.is_file():
+            raise
         raise UsageError(
             f"{path} is no metrics file of a training run: give a run folder or its metrics.csv."
         ) from None
@@ -162,20 +186,17 @@ def read_training_run(folder: Path, label: str | None = None) -> TrainingRun:
     """
     if not is_run(folder):
         raise UsageError(f"{folder} holds no run: give a folder that 'rl2grid train' wrote.")
-    try:
-        config = read_configuration(folder)
-        request, identity = config["request"], config["identity"]
-        hyperparameters = dict(request["hyperparameters"])
-        seed = int(hyperparameters.pop("seed"))
-        task, algorithm, keywords = request["task"], request["algorithm"], request["env_keywords"]
-        settings = {
-            **{key: value for key, value in identity.items() if key != "seed"},
-            **keywords,
-            **hyperparameters,
-            "algorithm": algorithm,
-        }
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UsageError(f"{folder / RUN_FILE} is no description of a run: {error!r}.") from None
+    config = read_configuration(folder)
+    request, identity = config["request"], config["identity"]
+    hyperparameters = dict(request["hyperparameters"])
+    seed = int(hyperparameters.pop("seed"))
+    task, algorithm, keywords = request["task"], request["algorithm"], request["env_keywords"]
+    settings = {
+        **{key: value for key, value in identity.items() if key != "seed"},
+        **keywords,
+        **hyperparameters,
+        "algorithm": algorithm,
+    }
     heuristic = keywords.get("heuristic")
     name = label or (f"{algorithm} + {heuristic}" if heuristic else algorithm)
     return TrainingRun(folder, task, settings, seed, read_training_curve(folder, name))

@@ -36,7 +36,6 @@ from rl2grid.records.studies import (
     RUN_FOLDER,
     CellResult,
     read_cell,
-    read_json,
     read_result,
     write_cell,
     write_result,
@@ -96,7 +95,10 @@ def run_cell(folder: Path) -> None:
 
 
 def _finish(folder: Path) -> None:
-    cell = cell_from_dict(read_json(folder / CELL_FILE))
+    stored = read_cell(folder)
+    if stored is None:
+        raise UsageError(f"{folder} holds no cell: there is no {CELL_FILE} in it.")
+    cell = cell_from_dict(stored)
     agent: str | Path = cell.agent
     if cell.training is not None:
         agent = folder / RUN_FOLDER

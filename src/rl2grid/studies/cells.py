@@ -9,6 +9,7 @@ from typing import Any
 
 from rl2grid.algorithms.registry import Hyperparameters
 from rl2grid.envs.tasks import Task, find_task
+from rl2grid.errors import UsageError
 from rl2grid.evaluation.protocol import first_months
 from rl2grid.records.studies import CELLS_FOLDER
 from rl2grid.studies.toml_file import with_tuples
@@ -93,9 +94,15 @@ def cell_from_dict(stored: Mapping[str, Any]) -> Cell:
     """The inverse of :func:`cell_to_dict`.
 
     Raises:
-        TypeError: the entries are not those of a cell.
-        UsageError: there is no such task.
+        UsageError: there is no such task, or the entries are not those of a cell.
     """
+    try:
+        return _cell_from_dict(stored)
+    except (TypeError, KeyError, AttributeError) as error:
+        raise UsageError(f"Cell {stored.get('name')!r} is none of this version of rl2grid: {error}.") from None
+
+
+def _cell_from_dict(stored: Mapping[str, Any]) -> Cell:
     cell = {**stored, "task": find_task(stored["task"]), "environment": with_tuples(stored["environment"])}
     if cell["training"] is not None:
         training = cell["training"]

@@ -22,7 +22,7 @@ from rl2grid.evaluation.flags import evaluate_command, flags
 from rl2grid.evaluation.protocol import evaluate
 from rl2grid.evaluation.recording import record_episode
 from rl2grid.records.evaluations import Evaluation
-from rl2grid.records.files import make_folder
+from rl2grid.records.files import check_own, make_folder
 from rl2grid.records.recordings import Recording
 from rl2grid.records.trainings import read_training_curve
 from rl2grid.scenarios.library import list_scenarios
@@ -60,6 +60,7 @@ def run_demo(output: Path, decisions: int | None = None, *, progress: bool = Tru
     Raises:
         UsageError: ``decisions`` is too small, or ``output`` holds a training of another length.
     """
+    check_own(output, ("run", "report.html"), "demonstration")
     make_folder(output)
     console = Console(stderr=True, quiet=not progress)
     register_all()

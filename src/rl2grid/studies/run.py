@@ -16,9 +16,17 @@ from typing import Any
 
 from rich.console import Console
 
-from rl2grid.records.files import make_folder
+from rl2grid.errors import UsageError
+from rl2grid.records.files import check_own, make_folder
 from rl2grid.records.locks import is_locked
-from rl2grid.records.studies import read_result, write_study, write_study_episodes
+from rl2grid.records.studies import (
+    CELLS_FOLDER,
+    STUDY_FILE,
+    read_result,
+    read_study,
+    write_study,
+    write_study_episodes,
+)
 from rl2grid.records.versions import library_versions
 from rl2grid.studies.backends import Backend, Job
 from rl2grid.studies.cell import BUSY, FINISHED, REFUSED, STOPPED, commands, last_error, prepare
@@ -43,6 +51,8 @@ def run_study(study: Study, backend: Backend, console: Console | None = None) ->
         UsageError: the study's folder holds cells of another definition; nothing was begun.
         KeyboardInterrupt: the user asked to stop; all cells have written their checkpoints.
     """
+    check_own(study.output, (STUDY_FILE, CELLS_FOLDER), "study")
+    _check_same_study(study)
     make_folder(study.output)
     for cell in study.cells:
         if (study.folder(cell)).exists():
@@ -61,6 +71,16 @@ def run_study(study: Study, backend: Backend, console: Console | None = None) ->
     if stop.is_set():
         raise KeyboardInterrupt
     return runner.states
+
+
+def _check_same_study(study: Study) -> None:
+    stored = read_study(study.output) or {}
+    for key, value in (("name", study.name), ("scale", study.scale)):
+        if stored.get(key, value) != value:
+            raise UsageError(
+                f"{study.output} holds a study with another {key} ({stored[key]!r}): choose another "
+                "folder with --output."
+            )
 
 
 class _Runner:

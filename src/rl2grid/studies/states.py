@@ -102,4 +102,4 @@ def look(state: CellState) -> None:
 def _recorded_failures(folder: Path) -> dict[str, str]:
     """Error messages of the cells that the last process of the study gave up."""
     stored = read_study(folder) or {"cells": []}
-    return {entry["cell"]: entry["error"] for entry in stored["cells"] if entry["state"] == State.FAILED}
+    return {entry["cell"]: str(entry.get("error")) for entry in stored["cells"] if entry.get("state") == State.FAILED}

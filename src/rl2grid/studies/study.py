@@ -31,10 +31,11 @@ from typing import Any
 
 from rl2grid.algorithms.registry import algorithm_names, find_algorithm
 from rl2grid.engines import HEURISTICS
-from rl2grid.envs.options import TaskOptions
+from rl2grid.envs.options import TaskOptions, options_of
 from rl2grid.envs.tasks import Task, constraint_of, find_task
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import AGENTS, kinds_of
+from rl2grid.evaluation.protocol import first_months
 from rl2grid.mdp.rewards import resolve_reward
 from rl2grid.scenarios.splits import SPLITS
 from rl2grid.studies.cells import Cell, Study, Training
@@ -171,6 +172,8 @@ class _Group:
         )
         try:
             _check_training_and_constraint(cell)
+            options_of(task, cell.environment)
+            first_months(task, split, cell.months)
         except UsageError as error:
             raise UsageError(f"{upper(self.where)}: {error}") from None
         return cell

@@ -10,6 +10,7 @@ from types import NoneType
 from typing import Any, get_args, get_origin
 
 from rl2grid.errors import UsageError
+from rl2grid.records.files import read_text
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -18,9 +19,12 @@ def read_toml(path: Path) -> dict[str, Any]:
     Raises:
         UsageError: it is no TOML file.
     """
+    contents = read_text(path, "a TOML file", "docs/studies.md says what one holds")
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
+        return tomllib.loads(contents)
+    except RecursionError:
+        raise UsageError(f"{path} is no TOML file of a study: it is nested too deeply.") from None
+    except ValueError as error:
         raise UsageError(f"{path} is no TOML file: {error}.") from None
 
 

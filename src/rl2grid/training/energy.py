@@ -48,7 +48,8 @@ class EnergyAccount:
     def __init__(self, folder: Path) -> None:
         """Begin to count; earlier parts are kept."""
         self._folder = folder
-        self._earlier = (read_energy(folder) or {"parts": []})["parts"]
+        account = read_energy(folder)
+        self._earlier = [] if account is None else account["parts"]
         self._tracker = _started_tracker()
         self._began = time.perf_counter()
         self._processor_began = _processor_seconds()

@@ -5,20 +5,20 @@ How it is met is the part of :mod:`rl2grid.training.runs`, which imports this mo
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 from rl2grid.algorithms.registry import Algorithm, Hyperparameters, algorithms_for, find_algorithm
-from rl2grid.envs.options import TaskOptions
+from rl2grid.envs.options import TaskOptions, options_of
 from rl2grid.envs.tasks import Task, constraint_of, find_task
 from rl2grid.errors import UsageError, one_of
 from rl2grid.evaluation.protocol import first_months
 from rl2grid.mdp.actions import action_set_hash
 from rl2grid.mdp.constraint_table import CONSTRAINTS, THRESHOLDS
-from rl2grid.records.trainings import RUN_FILE, read_configuration
+from rl2grid.mdp.rewards import resolve_reward
+from rl2grid.records.trainings import RUN_FILE, is_run, read_configuration
 from rl2grid.records.versions import TARGETS_VERSION, library_versions
 from rl2grid.scenarios.library import check_in_split, generator_version, scenario_pack_hash, split_version
 from rl2grid.scenarios.splits import TRAIN, VALIDATION, VALIDATION_MONTHS
@@ -121,6 +121,8 @@ def complete(args: RunArgs) -> RunArgs:
             raise one_of("Environment keyword", name, allowed)
     if callable(keywords.get("reward")):
         raise UsageError("A run stores its reward by name: choose a preset or three weights, not a function.")
+    options_of(task, keywords)
+    resolve_reward(keywords.get("reward", "default"))
     # Every keyword is stored, so that the run stays what it is when a default changes.
     keywords = {name: getattr(TaskOptions(**keywords), name) for name in allowed}
     if keywords["split"] != TRAIN:
@@ -129,8 +131,9 @@ def complete(args: RunArgs) -> RunArgs:
         check_in_split(task.grid_id, TRAIN, keywords["scenario"])
     if args.evaluate_every < 1:
         raise UsageError(f"evaluate_every must be at least 1 decision, not {args.evaluate_every}.")
-    if args.validation_months != 0:
-        first_months(task, VALIDATION, args.validation_months)
+    months = args.validation_months
+    if months is not None and not 0 <= months <= VALIDATION_MONTHS:  # the usual number is an upper limit
+        first_months(task, VALIDATION, months)
     check_tracking(args.wandb_project)
     resolved = replace(args, folder=find_folder(args), env_keywords=keywords)
     find_limits(resolved)  # refuses what cannot be constrained
@@ -182,20 +185,21 @@ def read_config(folder: Path) -> tuple[RunArgs, dict[str, Any]]:
     Raises:
         UsageError: the folder holds no run.
     """
+    if not is_run(folder):
+        raise UsageError(
+            f"{str(folder)!r} holds no run: there is no {RUN_FILE} in it; give a folder that 'rl2grid train' wrote."
+        )
+    config = read_configuration(folder)
+    request = dict(config["request"])
     try:
-        config = read_configuration(folder)
-        request = dict(config["request"])
         algorithm = find_algorithm(request["algorithm"])
         request["hyperparameters"] = algorithm.args(**_tuples(request["hyperparameters"]))
         request["env_keywords"] = _tuples(request["env_keywords"])
+        TaskOptions(**request["env_keywords"])
         return RunArgs(**request, folder=folder), config["identity"]
-    except (FileNotFoundError, NotADirectoryError) as error:
+    except TypeError as error:
         raise UsageError(
-            f"{str(folder)!r} holds no run: there is no {RUN_FILE} in it; give a folder that 'rl2grid train' wrote."
-        ) from error
-    except (json.JSONDecodeError, KeyError, TypeError) as error:
-        raise UsageError(
-            f"File {str(folder / RUN_FILE)!r} does not describe a run of this version of rl2grid."
+            f"File {str(folder / RUN_FILE)!r} does not describe a run of this version of rl2grid ({error})."
         ) from error
 
 

@@ -32,11 +32,12 @@ from rl2grid.algorithms.metrics import MetricsWriter
 from rl2grid.algorithms.policy_agent import BEST_FILE, CHECKPOINT_FILE, PolicyAgent
 from rl2grid.algorithms.registry import VectorEnvironment, find_algorithm
 from rl2grid.algorithms.trainer import Trainer
+from rl2grid.envs.options import changed_options
 from rl2grid.envs.registration import register_all
 from rl2grid.errors import UsageError
 from rl2grid.records import logs
 from rl2grid.records.locks import LockedError, locked
-from rl2grid.records.trainings import create_run_folder
+from rl2grid.records.trainings import RUN_FILE, create_run_folder
 from rl2grid.training.energy import EnergyAccount
 from rl2grid.training.interrupts import stop_requests
 from rl2grid.training.limits import TimeLimit
@@ -67,7 +68,7 @@ def make_envs(args: RunArgs) -> VectorEnvironment:
         num_threads=args.num_threads,
         num_workers=args.num_workers,
         gamma=args.hyperparameters.gamma,
-        **args.env_keywords,
+        **changed_options(args.env_keywords),
     )
 
 
@@ -101,9 +102,10 @@ def train(
     try:
         trainer = find_algorithm(args.algorithm).trainer(args.hyperparameters, envs)
         identity = identity_of(args)
-        create_run_folder(folder, configuration_of(args, identity))
+        run = _Run(folder, args, identity, trainer, evaluate)
+        create_run_folder(folder, configuration_of(args, identity), run.save_beginning)
         with _locked(folder):
-            _run(_Run(folder, args, identity, trainer, evaluate), envs, limit, None)
+            _run(run, envs, limit, None)
     finally:
         envs.close()
     return folder
@@ -117,12 +119,13 @@ def resume(
     progress: bool = True,
     make_envs: Callable[[RunArgs], VectorEnvironment] = make_envs,
 ) -> Path:
-    """Go on with the run in ``folder``, from its last checkpoint (or the beginning, if there is none yet).
+    """Go on with the run in ``folder``, from its last checkpoint.
 
     ``progress`` says whether a bar is shown, which is not for one that was begun without.
 
     Raises:
-        UsageError: no run there, one that another process is writing, or one made of other data.
+        UsageError: no run there, one that another process is writing, one made of other data, or one whose checkpoint
+            is missing, damaged or another run's: to begin again would overwrite what was reached.
     """
     args, identity = read_config(folder)
     check_tracking(args.wandb_project)
@@ -135,19 +138,40 @@ def resume(
                     f"now it is {now.get(name)}."
                 )
         args = replace(args, progress=progress and args.progress)
-        checkpoint = None
-        if (folder / CHECKPOINT_FILE).exists():
-            checkpoint = load_checkpoint(folder / CHECKPOINT_FILE, task=args.task.id)
+        checkpoint = _checkpoint_of(folder, args)
         envs = make_envs(args)
         try:
             trainer = find_algorithm(args.algorithm).trainer(args.hyperparameters, envs)
             run = _Run(folder, args, now, trainer, evaluate)
-            if identity["versions"] != now["versions"]:
+            if identity.get("versions") != now["versions"]:
                 run.note(f"library versions differ from those the run began with: {now['versions']}")
-            _run(run, envs, limit, checkpoint)
+            _run(run, envs, limit, checkpoint if checkpoint["decisions"] else None)
         finally:
             envs.close()
     return folder
+
+
+def _checkpoint_of(folder: Path, args: RunArgs) -> dict[str, Any]:
+    """The checkpoint of a run, which every run has from its beginning.
+
+    Raises:
+        UsageError: it is missing, damaged, or was written by another run.
+    """
+    path = folder / CHECKPOINT_FILE
+    if not path.is_file():
+        raise UsageError(
+            f"The run in {str(folder)!r} cannot be resumed: its {CHECKPOINT_FILE} is missing, and to begin again would "
+            "overwrite what it has reached; restore the file, or begin a new run in another folder."
+        )
+    checkpoint = load_checkpoint(path, task=args.task.id)
+    mine = {"algorithm": args.algorithm, "hyperparameters": asdict(args.hyperparameters)}
+    for name, value in mine.items():
+        if checkpoint.get(name) != value:
+            raise UsageError(
+                f"The run in {str(folder)!r} cannot be resumed: its {CHECKPOINT_FILE} is of a run with other "
+                f"{name} than its {RUN_FILE} says."
+            )
+    return checkpoint
 
 
 def is_finished(folder: Path) -> bool:
@@ -180,6 +204,18 @@ class _Run:
 
     def contents(self) -> dict[str, Any]:
         """The sections of a checkpoint, without ``training``."""
+        return {**self._description(), "policy": self.trainer.policy_state()}
+
+    def save(self) -> None:
+        """Write ``checkpoint.pt``."""
+        contents = {**self.contents(), "training": self.trainer.state_dict(), "run": self._progress()}
+        save_checkpoint(self.folder / CHECKPOINT_FILE, contents)
+
+    def save_beginning(self, folder: Path) -> None:
+        """Write a ``checkpoint.pt`` that nothing was learned for yet: where there is none, it was lost."""
+        save_checkpoint(folder / CHECKPOINT_FILE, {**self._description(), "run": self._progress()})
+
+    def _description(self) -> dict[str, Any]:
         return {
             "algorithm": self.args.algorithm,
             "task": self.args.task.id,
@@ -187,18 +223,14 @@ class _Run:
             "hyperparameters": asdict(self.args.hyperparameters),
             "identity": dict(self.identity),
             "decisions": self.trainer.decisions,
-            "policy": self.trainer.policy_state(),
         }
 
-    def save(self) -> None:
-        """Write ``checkpoint.pt``."""
-        run = {
+    def _progress(self) -> dict[str, Any]:
+        return {
             "best_score": self.best_score,
             "wall_time": self.wall_time,
             "finished": self.trainer.finished,
         }
-        contents = {**self.contents(), "training": self.trainer.state_dict(), "run": run}
-        save_checkpoint(self.folder / CHECKPOINT_FILE, contents)
 
     def load(self, checkpoint: Mapping[str, Any]) -> None:
         """Be where the run was when ``checkpoint`` was written."""

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from rl2grid.algorithms.policy_agent import PolicyAgent
-from rl2grid.evaluation.protocol import evaluate, first_months
+from rl2grid.envs.options import changed_options
+from rl2grid.evaluation.protocol import at_most, evaluate
 from rl2grid.records.summary import safe_episodes
 from rl2grid.training.request import RunArgs, find_limits
 
@@ -32,11 +33,15 @@ def validator(args: RunArgs) -> Evaluate:
         UsageError: the run cannot be constrained as asked.
     """
     limits = find_limits(args)
-    scenarios = first_months(args.task, "validation", args.validation_months)
-    keywords = {name: value for name, value in args.env_keywords.items() if name not in OF_TRAINING}
+    scenarios = at_most(args.task, "validation", args.validation_months)
+    heuristic = args.env_keywords.get("heuristic")
+    chosen = changed_options(args.env_keywords)
+    keywords = {name: value for name, value in chosen.items() if name not in (*OF_TRAINING, "heuristic")}
 
     def validate(agent: PolicyAgent) -> dict[str, float]:
-        result = evaluate(agent, args.task, scenarios=scenarios, workers=args.num_workers, **keywords)
+        result = evaluate(
+            agent, args.task, scenarios=scenarios, heuristic=heuristic, workers=args.num_workers, **keywords
+        )
         summary = result.summary
         means = {
             "survival": summary.survival.value,
