@@ -31,9 +31,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numba
 import numpy as np
 
 from rl2grid.algorithms.policy_agent import load_agent
+from rl2grid.compiled_files import verify_files_of
 from rl2grid.engines import ENGINES  # noqa: F401 - loads the native engine before anything is measured
 from rl2grid.envs.tasks import find_task
 from rl2grid.errors import UsageError
@@ -126,6 +128,7 @@ def make_samples(folder: Path) -> None:
         (results / "study.toml").write_text(_toml(number))
         _make_study(folder / f"study-{name}", seeds=number + 1)
         _make_data(folder / f"data-{name}", seed=3 + number)
+        _call(folder / f"code-{name}", (_double, _triple)[number])
 
 
 def _train(folder: Path, algorithm: str, seed: int) -> Path:
@@ -183,6 +186,25 @@ def _make_data(folder: Path, seed: int) -> None:
     arrays = {name: np.array(getattr(scenario, name)) for name in ("load_p", "load_q", "prod_p", "prod_v")}
     content = FolderContent(scenario.start_datetime, arrays)
     _in_data(folder, lambda: store_imported(load_grid("bus14"), "mine", content))
+
+
+def _double(x: int) -> int:
+    return 2 * x
+
+
+def _triple(x: int) -> int:
+    return 3 * x
+
+
+def _call(folder: Path, function: Callable[[int], int]) -> int:
+    """Call a function as a process does that finds its machine code in the folder, or compiles it."""
+    before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(folder)
+    try:
+        compiled = numba.njit(cache=True)(function)
+        verify_files_of(compiled)
+        return int(compiled(4))
+    finally:
+        numba.config.CACHE_DIR = before
 
 
 def _in_data(folder: Path, do: Callable[[], Any]) -> Any:
@@ -311,6 +333,8 @@ KINDS = (
         by_hand=True,
         alone=True,
     ),
+    Kind("index of compiled code", "code", "*/*.nbi", lambda folder: _call(folder, _double), 0.5),
+    Kind("compiled code", "code", "*/*.nbc", lambda folder: _call(folder, _double), 0.5),
     Kind("pack", "data", "packs/*/*/*.pack", _made, 0.1),
     Kind("expanded series", "data", "series/*/*/generated.*.npy", _expanded, 0.3),
     Kind("manifest of a series", "data", "series/*/*/generated.*.json", _expanded, 0.3),

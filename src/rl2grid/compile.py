@@ -16,6 +16,8 @@ from typing import Any, TypeVar, cast
 import numba
 import platformdirs
 
+from rl2grid.compiled_files import verify_files_of
+
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 _RUNTIME = "_nrt"
@@ -54,6 +56,7 @@ def jit(function: Function) -> Function:
         compiled: Function = numba.njit(cache=True, error_model="numpy", nogil=True)(function)
     finally:
         numba.config.CACHE_DIR = previous
+    verify_files_of(compiled)
     return compiled
 
 

@@ -1,4 +1,4 @@
-"""The one exception that a user is meant to read."""
+"""The one exception that a user is meant to read, and the one warning."""
 
 
 class UsageError(ValueError):
@@ -6,6 +6,10 @@ class UsageError(ValueError):
 
     The command line prints the sentence alone, without a traceback.
     """
+
+
+class DamageWarning(UserWarning):
+    """A file that was damaged, and what was done without it; the command line prints the sentence alone."""
 
 
 def one_of(what: str, value: object, allowed: "list[str] | tuple[str, ...]") -> UsageError:

@@ -2,9 +2,11 @@
 
 import base64
 import json
+import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from importlib import resources
 
 import numpy as np
@@ -93,6 +95,17 @@ def test_the_page_is_whole_and_needs_nothing_else(tmp_path):
     embedded = text.split("id=episode>")[1].split("</script>")[0]
     assert json.loads(embedded)["decisions"][1] == [4, "substation 1: </script> & <b>"]
     assert [path.name for path in tmp_path.iterdir()] == ["a.html"]
+
+
+def test_names_neither_break_the_page_nor_enter_it(tmp_path):
+    episode = replace(made_up(BUS14, 20), agent="{data}<!--<script>", actions=("{script}", "<!--<script>"))
+    write_watch_page(tmp_path / "page.html", BUS14, episode)
+    page = (tmp_path / "page.html").read_text()
+    assert "<h1>{data}&lt;!--&lt;script&gt; + idle on" in page
+    assert "<!--" not in page
+    assert page.count("<script") == page.count("</script>") == 2
+    (data,) = re.findall(r"id=episode>(.*?)</script>", page)
+    assert [words for _, words in json.loads(data)["decisions"]] == ["{script}", "<!--<script>"]
 
 
 def test_the_legend_has_the_colours_of_the_lines_in_light_and_dark(tmp_path):

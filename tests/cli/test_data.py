@@ -5,6 +5,7 @@ import io
 import shutil
 from pathlib import Path
 
+import filelock
 import numpy as np
 import pytest
 
@@ -166,8 +167,31 @@ def test_what_can_be_made_again_is_removed_after_asking(capsys, folder: Path, mo
     assert (folder / "packs").exists()
     assert main(["data", "clean", "--yes"]) == 0
     assert "MB" in capsys.readouterr().out
-    assert files(folder) == ["imported/bus14/mine.npz"]
+    assert [name for name in files(folder) if not name.endswith(".lock")] == ["imported/bus14/mine.npz"]
     assert load_scenario("bus14", "folder/mine").n_rows == 40
+
+
+def test_what_is_being_made_is_left_alone_and_what_may_not_be_removed_is_told(
+    capsys, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("packs/bus14/x/17-03.pack", "packs/bus14/x/18-03.pack", "series/v1/bus14/generated.3-00-a.npy"):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(bytes(1000))
+    with filelock.FileLock(folder / "packs/bus14/x/17.lock"):
+        assert main(["data", "clean", "--yes"]) == 0
+    shown = capsys.readouterr().out
+    assert "2.0 kB" in shown
+    assert "1 files that another process is making were left alone." in shown
+    assert [name for name in files(folder) if not name.endswith(".lock")] == ["packs/bus14/x/17-03.pack"]
+
+    def refuse(path: Path, missing_ok: bool = False) -> None:
+        raise PermissionError(1, "Operation not permitted", str(path))
+
+    monkeypatch.setattr(Path, "unlink", refuse)
+    assert main(["data", "clean", "--yes"]) == 1
+    captured = capsys.readouterr()
+    assert "0 bytes" in captured.out
+    assert captured.err == "rl2grid: 1 files may not be removed by this user.\n"
 
 
 @pytest.mark.slow

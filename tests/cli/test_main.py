@@ -1,13 +1,17 @@
 """The command line: what it prints, and how it refuses."""
 
+import errno
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import pytest
 
 from rl2grid.algorithms import ppo
+from rl2grid.cli import tasks
 from rl2grid.cli.main import main
+from rl2grid.errors import DamageWarning, UsageError
 from rl2grid.records.evaluations import load_evaluation
 
 
@@ -28,6 +32,46 @@ def test_tasks_lists_all_with_their_sizes(capsys):
     assert "73,357 discrete" in output
     assert "69 continuous" in output
     assert "multi-area opponent" in output
+
+
+@pytest.mark.parametrize(
+    ("error", "sentence"),
+    [
+        (
+            OSError(errno.ENOSPC, "No space left on device", "runs/a/metrics.csv"),
+            "runs/a/metrics.csv cannot be read or written: No space left on device; make room, and begin or resume "
+            "again.",
+        ),
+        (OSError(errno.EROFS, "Read-only file system"), "A file cannot be read or written: Read-only file system."),
+        (UsageError("Agent \x1b[31mred\x07 is unknown."), "Agent  [31mred  is unknown."),
+    ],
+)
+def test_a_full_or_read_only_disk_is_one_sentence(monkeypatch, capsys, error, sentence):
+    def fail(options, output):
+        raise error
+
+    monkeypatch.setattr(tasks, "_run", fail)
+    assert refused(capsys, "tasks") == f"rl2grid: {sentence}"
+
+
+def test_what_was_set_aside_is_said_in_one_sentence(monkeypatch, capsys):
+    def warn(options, output):
+        warnings.warn("It was set aside.", DamageWarning, stacklevel=1)
+        return 0
+
+    monkeypatch.setattr(tasks, "_run", warn)
+    for _ in range(2):  # every time
+        assert main(["tasks"]) == 0
+        assert capsys.readouterr().err == "rl2grid: It was set aside.\n"
+
+
+@pytest.mark.parametrize("missing", ["torch", "matplotlib"])
+def test_without_the_extras_the_demonstration_says_what_to_install(missing):
+    hide = f"import sys; sys.modules[{missing!r}] = None; from rl2grid.cli.main import main; sys.exit(main(['demo']))"
+    done = subprocess.run([sys.executable, "-c", hide], capture_output=True)
+    assert done.returncode == 2
+    (sentence,) = done.stderr.decode().strip().splitlines()
+    assert sentence.endswith("install it with `pip install rl2grid[train,analysis]`.")
 
 
 def test_tasks_of_one_grid(capsys):

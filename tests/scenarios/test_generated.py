@@ -1,8 +1,11 @@
 """Generated months: named, made once, kept, repaired, and never trained on where they are held out."""
 
+import hashlib
 import itertools
+import json
 import shutil
 import threading
+import zlib
 from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
@@ -85,6 +88,48 @@ def test_a_pack_spares_the_generator_and_a_damaged_one_is_made_again(made) -> No
         forget_expanded()
         assert load_scenario("bus14", "generated/17-03").content_hash == before
         assert made == [(17, 3)]
+
+
+def test_the_pack_of_another_month_in_its_place_is_made_again(made) -> None:
+    hashes = {name: generated.series_hash(BUS14, name) for name in ("17-03", "17-04")}
+    packs = [generated.pack_path(BUS14, 17, month) for month in (3, 4)]
+    shutil.copyfile(packs[1], packs[0])
+    shutil.copyfile(packs[1].with_suffix(".head"), packs[0].with_suffix(".head"))
+    made.clear()
+    assert generated.series_hash(BUS14, "17-03") == hashes["17-03"]
+    assert made == [(17, 3)]
+    shutil.copyfile(packs[1], packs[0])
+    assert load_scenario("bus14", "generated/17-03").load_p.shape[0] == MONTH_STEPS + 1
+    assert made == [(17, 3), (17, 3)]
+
+
+def test_an_edited_hash_in_the_head_of_a_pack_is_noticed(made) -> None:
+    before, path = generated.series_hash(BUS14, "17-03"), generated.pack_path(BUS14, 17, 3)
+    path.write_bytes(path.read_bytes().replace(before.encode(), ("0" * len(before)).encode()))
+    assert generated.series_hash(BUS14, "17-03") == before
+    assert made == [(17, 3), (17, 3)]
+
+
+def test_a_pack_that_expands_to_more_than_a_month_is_not_expanded(made, monkeypatch) -> None:
+    generated.series_hash(BUS14, "17-03")
+    path = generated.pack_path(BUS14, 17, 3)
+    assert generated._is_bounded(path)
+    monkeypatch.setattr(generated, "_MONTH_BYTES", 2**20)
+    head, _, _ = path.read_bytes().partition(b"\n")
+    body = zlib.compress(bytes(2**22))
+    header = json.loads(head) | {"sha256": hashlib.sha256(body).hexdigest()}
+    path.write_bytes(json.dumps(header).encode() + b"\n" + body)
+    assert not generated._is_bounded(path)
+    assert generated._read(BUS14, 17, 3) is None
+
+
+def test_what_a_killed_maker_left_is_removed(made) -> None:
+    folder = generated.pack_folder(BUS14)
+    folder.mkdir(parents=True)
+    for name in (".17-03.pack.12345", ".18-03.pack.12345"):
+        (folder / name).write_bytes(b"half")
+    generated.series_hash(BUS14, "17-03")
+    assert [path.name for path in folder.glob(".*.pack.*")] == [".18-03.pack.12345"]
 
 
 def test_a_month_is_made_once_by_several_makers(made) -> None:

@@ -10,8 +10,10 @@ import pytest
 
 from rl2grid.errors import UsageError
 from rl2grid.grids import load_grid
+from rl2grid.scenarios import folder as scenario_folder
 from rl2grid.scenarios.bundled import bundled_folders
 from rl2grid.scenarios.cache import data_folder
+from rl2grid.scenarios.folder import read_folder
 from rl2grid.scenarios.library import import_folder, load_scenario
 
 BUS14 = load_grid("bus14")
@@ -137,6 +139,19 @@ def test_a_truncated_archive_is_refused(folder: Path) -> None:
     path.write_bytes(path.read_bytes()[:1000])
     with pytest.raises(UsageError, match="a complete CSV file is needed"):
         import_folder(BUS14, folder)
+
+
+def test_an_archive_that_expands_without_end_is_refused(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = folder / "prod_p.csv.bz2"
+    content = path.read_bytes()
+    path.write_bytes(content + bz2.compress(b""))  # several streams in a row are one file
+    before = read_folder(load_grid("bus14"), folder).arrays["prod_p"]
+    monkeypatch.setattr(scenario_folder, "MAX_TABLE_BYTES", 2**22)
+    path.write_bytes(bz2.compress(bytes(2**24)))
+    assert path.stat().st_size < 200
+    with pytest.raises(UsageError, match=r"prod_p\.csv\.bz2 cannot be read \(it expands to more than 4 MiB\)"):
+        read_folder(load_grid("bus14"), folder)
+    assert before.size
 
 
 def test_a_missing_folder_is_named(tmp_path: Path) -> None:

@@ -127,6 +127,8 @@ def _write_mp4(path: Path, pictures: Iterator[Frame]) -> None:
         writer.send(np.ascontiguousarray(first))
         for picture in pictures:
             writer.send(np.ascontiguousarray(picture))
+    except OSError:
+        raise UsageError(f"{path.name} cannot be written: the encoder of MP4 ended early; is there room?") from None
     finally:
         writer.close()
 

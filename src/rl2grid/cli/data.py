@@ -38,6 +38,8 @@ from rl2grid.scenarios.progress import Report
 from rl2grid.scenarios.splits import HELD_OUT_SPLITS
 
 ALL_MONTHS = "0-11"
+REFUSED = 1
+"""Exit status when files could not be removed."""
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -224,10 +226,14 @@ def _clean(options: argparse.Namespace, output: Output) -> int:
             output.text("Nothing was removed.")
             output.results(removed=0)
             return 0
-    inventory.remove_caches()
-    output.results(removed=n_bytes)
-    output.remark(f"Removed the {where}: {size}.")
-    return 0
+    removed = inventory.remove_caches()
+    output.results(removed=removed.size, in_use=removed.in_use, refused=removed.refused)
+    output.remark(f"Removed the {where}: {decimal(removed.size)}.")
+    if removed.in_use:
+        output.remark(f"{removed.in_use} files that another process is making were left alone.")
+    if removed.refused:
+        print(f"rl2grid: {removed.refused} files may not be removed by this user.", file=sys.stderr)
+    return REFUSED if removed.refused else 0
 
 
 def _add_download(actions: Any) -> None:

@@ -17,8 +17,8 @@ from typing import Any, NoReturn
 
 from rl2grid import __version__
 from rl2grid.cli.output import Output
-from rl2grid.errors import UsageError
-from rl2grid.records.files import DamageWarning, printable
+from rl2grid.errors import DamageWarning, UsageError
+from rl2grid.records.files import printable
 
 REFUSED = 2
 INTERRUPTED = 130

@@ -26,6 +26,8 @@ from rl2grid.scenarios.episodes import EpisodePlan
 
 _OUTLOOK_ARRAYS = ("load_p", "load_q", "prod_p", "prod_v")
 _COMPRESSION = 1
+MAX_BYTES = 2**28
+"""Of one array of a saved world: a text that expands to more holds none."""
 """Level of zlib: checkpoints are to be quick."""
 
 Bytes = NDArray[np.uint8]
@@ -288,7 +290,11 @@ def _text_of(array: NDArray[Any]) -> str:
 
 
 def _bytes_of(text: str) -> Bytes:
-    return np.frombuffer(zlib.decompress(base64.b64decode(text, validate=True)), np.uint8)
+    unpacking = zlib.decompressobj()
+    content = unpacking.decompress(base64.b64decode(text, validate=True), MAX_BYTES)
+    if not unpacking.eof:
+        raise ValueError(f"more than {MAX_BYTES} bytes")
+    return np.frombuffer(content, np.uint8)
 
 
 def _plain_value(value: Any) -> Any:

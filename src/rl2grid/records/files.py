@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from rl2grid.errors import UsageError
+from rl2grid.errors import DamageWarning, UsageError
 
 CHECKSUM = "checksum"
 """Entry of a JSON file, and name of the last column of a file that grows."""
@@ -29,10 +29,6 @@ DAMAGED = ".damaged"
 Shape = Any
 """What a value read from JSON must be: a type or a tuple of types; ``{key: shape}`` for an object that has at least
 these entries; ``[shape]`` for a list of such."""
-
-
-class DamageWarning(UserWarning):
-    """A file that was damaged, and what was done without it."""
 
 
 def write_text(path: Path, text: str) -> None:

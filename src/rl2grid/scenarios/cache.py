@@ -15,6 +15,7 @@ disk, is found by the latter alone.
 from __future__ import annotations
 
 import contextlib
+import glob
 import hashlib
 import json
 import os
@@ -120,14 +121,20 @@ def _make(data: Path, manifest: Path, content: FolderContent) -> CachedSeries:
         table[name] = {"dtype": portable, "shape": array.shape, "offset": size}
         size += array.nbytes
     digest = hashlib.sha256()
+    for leftover in data.parent.glob(f".{glob.escape(data.stem)}.*"):  # of processes that were killed; the lock is held
+        leftover.unlink(missing_ok=True)
     temporary = data.with_name(f".{data.name}.{os.getpid()}")
-    with temporary.open("wb") as stream:
-        header = {"descr": "|u1", "fortran_order": False, "shape": (size,)}
-        np.lib.format.write_array_header_1_0(stream, header)
-        for part in _parts(content.arrays):
-            digest.update(part)
-            stream.write(part)
-    os.replace(temporary, data)
+    try:
+        with temporary.open("wb") as stream:
+            header = {"descr": "|u1", "fortran_order": False, "shape": (size,)}
+            np.lib.format.write_array_header_1_0(stream, header)
+            for part in _parts(content.arrays):
+                digest.update(part)
+                stream.write(part)
+        os.replace(temporary, data)
+    except OSError:
+        temporary.unlink(missing_ok=True)
+        raise
     record = {"start_datetime": content.start_datetime.isoformat(), "arrays": table, "sha256": digest.hexdigest()}
     _write_manifest(manifest, record)
     series = _map(data, record)

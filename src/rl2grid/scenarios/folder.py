@@ -28,6 +28,8 @@ _OPTIONAL = ("prod_v", "load_p_forecasted", "load_q_forecasted", "prod_p_forecas
 _OUTAGES = ("maintenance", "hazards")
 _OF_ONE_GRID = ("prod_v", "prod_v_forecasted", *_OUTAGES)
 _SUFFIXES = (".csv", ".csv.bz2")
+MAX_TABLE_BYTES = 2**29
+"""Of a table that was unpacked: more than ten times the largest of a month of 118 substations."""
 _INFOS = ("start_datetime.info", "time_interval.info")
 
 DISPATCHABLE_TOLERANCE = 0.01
@@ -236,7 +238,7 @@ class _Reader:
 def _parse(file: Path, report: Report) -> tuple[list[str], Matrix]:
     """Header and values of a semicolon-separated file; ``report`` is told of its rows."""
     try:
-        raw = bz2.decompress(file.read_bytes()) if file.suffix == ".bz2" else file.read_bytes()
+        raw = _decompressed(file.read_bytes()) if file.suffix == ".bz2" else file.read_bytes()
         header_line, _, body = raw.decode().partition("\n")
     except (OSError, ValueError, EOFError) as error:
         raise UsageError(f"File {file} cannot be read ({error}): a complete CSV file is needed.") from error
@@ -254,6 +256,27 @@ def _parse(file: Path, report: Report) -> tuple[list[str], Matrix]:
         matrix[part] = values
         report(part.stop, len(lines))
     return header, matrix
+
+
+def _decompressed(content: bytes) -> bytes:
+    """What a bzip2 file holds, which may be several streams in a row.
+
+    Raises:
+        ValueError: more than :data:`MAX_TABLE_BYTES`.
+        EOFError: its end is missing.
+    """
+    parts: list[bytes] = []
+    left = MAX_TABLE_BYTES
+    while content:
+        unpacking = bz2.BZ2Decompressor()
+        parts.append(unpacking.decompress(content, left))
+        left -= len(parts[-1])
+        if not unpacking.eof:
+            if not unpacking.needs_input or left <= 0:
+                raise ValueError(f"it expands to more than {MAX_TABLE_BYTES // 2**20} MiB")
+            raise EOFError("its end is missing")
+        content = unpacking.unused_data
+    return b"".join(parts)
 
 
 def _bad_cell(file: Path, header: list[str], body: str) -> UsageError:

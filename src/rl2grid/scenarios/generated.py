@@ -9,11 +9,14 @@ read; a damaged one is made again; of what training has drawn only the latest is
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import itertools
 import json
+import os
 import re
+import zlib
 from collections.abc import Sequence
 from dataclasses import fields
 from importlib import resources
@@ -58,6 +61,10 @@ _POWER_FLOW = ("ac", "bits", "factors", "flow_state", "model", "newton", "orderi
 
 _NAME = re.compile(r"(?P<seed>0|[1-9]\d{0,18})-(?P<month>\d\d)(\+(?P<next>\d\d))?")
 _LOCKS = 64
+_PACK_BYTES, _MONTH_BYTES, _HEAD_BYTES = 2**26, 2**28, 2**12
+"""More than any pack takes, expands to, and has as its head."""
+_VERIFIED = ".head"
+"""Suffix of the file beside a pack whose head was verified."""
 _EXPANDED_MONTHS = itertools.count()
 """How many this process has expanded so far."""
 
@@ -180,17 +187,40 @@ def series_hash(grid: Grid, name: str) -> str:
     Raises:
         UsageError: there are no such months, or the data folder cannot be written.
     """
-    from rl2grid.scenarios.packs import read_series_hash
-
     months = parse_months(name)
     paths = [pack_path(grid, months.seed, month) for month in months.numbers]
     if not all(path.is_file() for path in paths):
         make_months(grid, months.seed, months.numbers)
-    hashes = [read_series_hash(path) for path in paths]
+    hashes = [_verified_hash(grid, months.seed, month) for month in months.numbers]
     if None in hashes:
         make_months(grid, months.seed, months.numbers)
-        hashes = [read_series_hash(path) for path in paths]
+        hashes = [_verified_hash(grid, months.seed, month) for month in months.numbers]
     return "+".join(str(each) for each in hashes)
+
+
+def _verified_hash(grid: Grid, seed: int, month: int) -> str | None:
+    """The hash in the head of a pack; None where there is no sound pack of that month.
+
+    A head that was verified against the values below it is remembered by its own hash in a file beside the pack.
+    """
+    from rl2grid.scenarios.packs import read_series_hash
+
+    path = pack_path(grid, seed, month)
+    try:
+        with path.open("rb") as stream:
+            head = hashlib.sha256(path.name.encode() + stream.readline(_HEAD_BYTES)).hexdigest()
+        known = path.with_suffix(_VERIFIED)
+        if known.is_file() and known.read_bytes() == head.encode():
+            return read_series_hash(path)
+    except OSError:
+        return None
+    if _read(grid, seed, month) is None:
+        return None
+    with contextlib.suppress(OSError):  # a folder that is only read is verified every time
+        temporary = known.with_name(f".{known.name}.{os.getpid()}")
+        temporary.write_bytes(head.encode())
+        os.replace(temporary, known)
+    return read_series_hash(path)
 
 
 def _content(grid: Grid, months: Months) -> FolderContent:
@@ -212,15 +242,20 @@ def _in_order(arrays: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
 
 def _read_or_make(grid: Grid, seed: int, months: Sequence[int]) -> list[RawMonth]:
     """Months of one year, from their packs; those without a sound one are made."""
-    found = [_read(pack_path(grid, seed, month)) for month in months]
+    found = [_read(grid, seed, month) for month in months]
     if None not in found:
         return [raw for raw in found if raw is not None]
     folder = pack_folder(grid)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with filelock.FileLock(folder / f"{seed % _LOCKS:02d}.lock"):
-            _make_missing(grid, seed, months)
-            made = [_read_back(pack_path(grid, seed, month)) for month in months]
+        with filelock.FileLock(pack_lock(folder, seed)):
+            _remove_leftovers(folder, seed)
+            try:
+                _make_missing(grid, seed, months)
+            except OSError:
+                _remove_leftovers(folder, seed)
+                raise
+            made = [_read_back(grid, seed, month) for month in months]
     except OSError as error:
         raise UsageError(
             f"The data folder {data_folder()} cannot be written ({error}): set RL2GRID_DATA to one that can."
@@ -233,8 +268,7 @@ def _read_or_make(grid: Grid, seed: int, months: Sequence[int]) -> list[RawMonth
 
 def _make_missing(grid: Grid, seed: int, months: Sequence[int]) -> None:
     for month in months:
-        path = pack_path(grid, seed, month)
-        if _read(path) is None:
+        if _read(grid, seed, month) is None:
             _make(grid, seed, month)
     if not is_training_seed(seed):
         return
@@ -252,21 +286,46 @@ def _make(grid: Grid, seed: int, month: int) -> None:
     packs.write_pack(pack_path(grid, seed, month), generator.raw_month(grid, seed, month))
 
 
-def _read(path: Path) -> RawMonth | None:
-    """The month in a pack, or None where there is no sound one."""
+def _read(grid: Grid, seed: int, month: int) -> RawMonth | None:
+    """The month in its pack; None where there is no sound one, or that of another month in its place."""
     from rl2grid.scenarios import packs
 
+    path = pack_path(grid, seed, month)
     try:
-        return packs.read_raw(path)
-    except UsageError:
-        return None
+        if not _is_bounded(path):
+            return None
+        raw = packs.read_raw(path)
+        sound = (raw.grid_id, raw.seed, raw.month) == (grid.id, seed, month)
+        return raw if sound and packs.read_series_hash(path) == packs.hash_of_month(raw) else None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, zlib.error):
+        return None  # whatever else the head of a pack may hold
 
 
-def _read_back(path: Path) -> RawMonth:
-    raw = _read(path)
+def _is_bounded(path: Path) -> bool:
+    """Whether a pack is no larger than packs are, and does not expand to more than a month is."""
+    if path.stat().st_size > _PACK_BYTES:
+        return False
+    unpacking = zlib.decompressobj()
+    length = len(unpacking.decompress(path.read_bytes().partition(b"\n")[2], _MONTH_BYTES))
+    return unpacking.eof and length < _MONTH_BYTES
+
+
+def _read_back(grid: Grid, seed: int, month: int) -> RawMonth:
+    raw = _read(grid, seed, month)
     if raw is None:
-        raise OSError(f"{path} does not read back as it was written")
+        raise OSError(f"{pack_path(grid, seed, month)} does not read back as it was written")
     return raw
+
+
+def pack_lock(folder: Path, seed: int) -> Path:
+    """The lock that whoever makes packs of the year of ``seed`` holds."""
+    return folder / f"{seed % _LOCKS:02d}.lock"
+
+
+def _remove_leftovers(folder: Path, seed: int) -> None:
+    """Remove what processes that were killed, or met a full disk, left of packs; the lock is held."""
+    for path in folder.glob(f".{seed}-*.pack.*"):
+        path.unlink(missing_ok=True)
 
 
 def _seed_of(path: Path) -> int:
@@ -286,7 +345,7 @@ def _remove_oldest(paths: list[Path], limit: int) -> None:
         if excess <= 0:
             return
         # What other processes have mapped stays readable for them.
-        for companion in (path, path.with_suffix(".json"), path.with_suffix(".lock")):
+        for companion in (path, *(path.with_suffix(suffix) for suffix in (".json", ".lock", _VERIFIED))):
             companion.unlink(missing_ok=True)
         excess -= size
 

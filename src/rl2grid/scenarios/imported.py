@@ -21,6 +21,8 @@ from rl2grid.scenarios.cache import CachedSeries, cached_series, data_folder
 from rl2grid.scenarios.folder import FolderContent
 
 _START = "start_datetime"
+MAX_BYTES = 2**32
+"""Of an imported series that was unpacked: years on the largest grids."""
 _NAME = re.compile(r"[^\[\]/\\]+")
 
 
@@ -65,15 +67,21 @@ def load_imported(grid: Grid, name: str) -> CachedSeries:
         UsageError: Its file is damaged.
     """
     path = imported_folder(grid) / f"{name}.npz"
-    key = hashlib.sha256(path.read_bytes()).hexdigest()
+    try:
+        key = hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise UsageError(f"Imported scenario {path} cannot be read: {error.strerror}.") from None
     return cached_series(grid.id, f"folder.{name}", key, lambda: _read(path))
 
 
 def _read(path: Path) -> FolderContent:
     try:
+        with zipfile.ZipFile(path) as archive:
+            if sum(part.file_size for part in archive.infolist()) > MAX_BYTES:
+                raise ValueError(f"it expands to more than {MAX_BYTES // 2**20} MiB")
         with np.load(path) as file:
             arrays = {name: file[name] for name in file.files}
         start = datetime.fromisoformat(str(arrays.pop(_START)))
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+    except (OSError, ValueError, KeyError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
         raise UsageError(f"Imported scenario {path} is damaged ({error}): import its folder again.") from error
     return FolderContent(start, arrays)

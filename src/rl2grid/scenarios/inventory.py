@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 from typing import NamedTuple
+
+import filelock
 
 from rl2grid.grids import Grid, find_system
 from rl2grid.scenarios.bundled import bundled_folders
 from rl2grid.scenarios.cache import data_folder
 from rl2grid.scenarios.full import full_data_folder
-from rl2grid.scenarios.generated import pack_folder, pack_path, parse_months
+from rl2grid.scenarios.generated import pack_folder, pack_lock, pack_path, parse_months
 from rl2grid.scenarios.imported import imported_folder, imported_names
 from rl2grid.scenarios.recorded import RecordedScenarios
 from rl2grid.scenarios.splits import HELD_OUT_SPLITS
@@ -56,10 +57,53 @@ def caches_size() -> int:
     return sum(size_of(data_folder() / name) for name in CACHES)
 
 
-def remove_caches() -> None:
-    """Remove expanded copies and generated packs; what was imported or downloaded stays."""
+class Removed(NamedTuple):
+    """What :func:`remove_caches` did."""
+
+    size: int
+    """Bytes that were freed."""
+    in_use: int
+    """Files that were left, because a process is making them or what belongs to them."""
+    refused: int
+    """Files that this user may not remove."""
+
+
+def remove_caches() -> Removed:
+    """Remove expanded copies and generated packs; what was imported or downloaded stays.
+
+    Processes at work are not disturbed: folders and locks stay, what is being made is left alone, and what others have
+    mapped stays readable for them.
+    """
+    removed = Removed(0, 0, 0)
     for name in CACHES:
-        shutil.rmtree(data_folder() / name, ignore_errors=True)
+        for path in sorted((data_folder() / name).rglob("*")):
+            if path.is_file() and path.suffix != ".lock":
+                removed = Removed(*map(sum, zip(removed, _remove(path), strict=True)))
+    return removed
+
+
+def _remove(path: Path) -> Removed:
+    try:
+        size = path.stat().st_size
+        with filelock.FileLock(_lock_of(path), timeout=0):
+            path.unlink(missing_ok=True)
+    except filelock.Timeout:
+        return Removed(0, 1, 0)
+    except FileNotFoundError:
+        return Removed(0, 0, 0)  # another process was faster
+    except OSError:
+        return Removed(0, 0, 1)
+    return Removed(size, 0, 0)
+
+
+def _lock_of(path: Path) -> Path:
+    """The lock that whoever makes a file of the caches holds."""
+    name = path.name.removeprefix(".")
+    if ".pack" in name or name.endswith(".head"):
+        seed = name.partition("-")[0]
+        return pack_lock(path.parent, int(seed)) if seed.isdigit() else path.with_suffix(".lock")
+    stem = name.partition(".npy")[0].partition(".json")[0]
+    return path.with_name(f"{stem}.lock")
 
 
 def _recorded(grid: Grid) -> list[StoredSeries]:

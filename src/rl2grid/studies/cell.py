@@ -208,6 +208,9 @@ def serve(do: Callable[[], None]) -> int:
     except UsageError as error:
         print(f"rl2grid: {error}", file=sys.stderr)
         return REFUSED
+    except OSError as error:  # a disk that is full may have room when it is tried again
+        print(f"rl2grid: {error.filename or 'A file'} cannot be read or written: {error.strerror}.", file=sys.stderr)
+        return FAILED
     except Exception:
         traceback.print_exc()
         return FAILED

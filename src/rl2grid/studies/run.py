@@ -51,7 +51,7 @@ def run_study(study: Study, backend: Backend, console: Console | None = None) ->
         UsageError: the study's folder holds cells of another definition; nothing was begun.
         KeyboardInterrupt: the user asked to stop; all cells have written their checkpoints.
     """
-    check_own(study.output, (STUDY_FILE, CELLS_FOLDER), "study")
+    check_own(study.output, (STUDY_FILE, CELLS_FOLDER, "jobs"), "study")
     _check_same_study(study)
     make_folder(study.output)
     for cell in study.cells:

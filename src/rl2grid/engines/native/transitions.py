@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -29,6 +28,7 @@ from rl2grid.engines.native.advance import (
     write_observations,
 )
 from rl2grid.engines.native.engine import NativeEngine
+from rl2grid.engines.native.threads import Threads
 from rl2grid.engines.transition import Transitions
 from rl2grid.grids import Grid
 from rl2grid.mdp.actions import (
@@ -171,7 +171,7 @@ class NativeTransitions(Transitions):
     def __post_init__(self) -> None:
         n = len(self.engine.state.step)
         self._reward_code = _COMPILED_IN.get(self.reward.components)
-        self._threads = ThreadPoolExecutor(os.cpu_count() or 1, "rl2grid")
+        self._threads = Threads(os.cpu_count() or 1, "rl2grid")
         self._rows = np.arange(n)
         self._nothing = commands_of(self.engine.grid, [DO_NOTHING] * n)
 

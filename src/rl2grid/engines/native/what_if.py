@@ -6,7 +6,6 @@ The power flow of the topology after the action is solved, as a step would solve
 from __future__ import annotations
 
 import enum
-from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
@@ -15,6 +14,7 @@ import numpy as np
 from rl2grid.arrays import F32, I8, I32, Flags
 from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.engines.native.environments import Environments
+from rl2grid.engines.native.threads import Threads
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
 from rl2grid.handles import Handle
@@ -98,7 +98,7 @@ class WhatIf:
         wiring = new_wiring(grid, self._network)
         self._snapshot = new_snapshot(grid)
         self._solvers = [BatchSolver(grid, self._network, wiring, self._snapshot) for _ in range(num_threads)]
-        self._threads = ThreadPoolExecutor(num_threads, "what-if")
+        self._threads = Threads(num_threads, "what-if")
 
     def actions(
         self, snapshot: Snapshot, catalogue: ActionCatalogue, ids: Ids | None = None, rho: F32 | None = None
