@@ -19,12 +19,16 @@ def double(x: int) -> int:
     return 2 * x
 
 
-def compiled(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+def triple(x: int) -> int:
+    return 3 * x
+
+
+def compiled(folder: Path, monkeypatch: pytest.MonkeyPatch, function: Callable[[int], int] = double) -> Any:
     """The function as another process would have it: nothing is compiled yet, files are looked for in the folder."""
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(folder))
-    function = numba.njit(cache=True)(double)
-    verify_files_of(function)
-    return function
+    made = numba.njit(cache=True)(function)
+    verify_files_of(made)
+    return made
 
 
 def _flip(content: bytes) -> bytes:
@@ -52,3 +56,12 @@ def test_damaged_machine_code_is_not_run(
     sound = compiled(tmp_path, monkeypatch)
     assert sound(4) == 8
     assert sum(sound.stats.cache_hits.values()) == 1
+
+
+def test_the_machine_code_of_another_function_is_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    for function, value in ((double, 8), (triple, 12)):
+        assert compiled(tmp_path, monkeypatch, function)(4) == value
+    mine, theirs = (next(tmp_path.rglob(f"*{name}-*.nbc")) for name in ("double", "triple"))
+    mine.write_bytes(theirs.read_bytes())
+    with pytest.warns(DamageWarning, match="was damaged"):
+        assert compiled(tmp_path, monkeypatch)(4) == 8

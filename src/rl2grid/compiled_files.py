@@ -1,7 +1,8 @@
 """Files of compiled code that are verified before they are run.
 
 Numba takes whatever its cache holds for machine code: a flipped bit ends in a traceback, or in a crash. Here every file
-ends with the SHA-256 of what is before; one that does not is left out with a notice, and compiled again in its place.
+ends with the SHA-256 of its name and of what is before; one that does not is left out with a notice, and compiled
+again in its place.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from numba.core.caching import IndexDataCacheFile
 from rl2grid.errors import DamageWarning
 
 _DIGEST = hashlib.sha256().digest_size
+"""Bytes at the end of a file."""
 
 
 class VerifiedCacheFile(IndexDataCacheFile):  # type: ignore[misc]
@@ -40,7 +42,7 @@ class VerifiedCacheFile(IndexDataCacheFile):  # type: ignore[misc]
         content = io.BytesIO()
         yield content
         with super()._open_for_write(filepath) as file:
-            file.write(content.getvalue() + hashlib.sha256(content.getvalue()).digest())
+            file.write(content.getvalue() + _digest(Path(filepath).name, content.getvalue()))
 
 
 def verify_files_of(compiled: Any) -> None:
@@ -50,9 +52,14 @@ def verify_files_of(compiled: Any) -> None:
         file.__class__ = VerifiedCacheFile
 
 
+def _digest(name: str, content: bytes) -> bytes:
+    """The hash of a file and its name: that of another function in its place is another file."""
+    return hashlib.sha256(name.encode() + content).digest()
+
+
 def _is_sound(path: Path) -> bool:
     content = path.read_bytes()
-    if hashlib.sha256(content[:-_DIGEST]).digest() == content[-_DIGEST:]:
+    if _digest(path.name, content[:-_DIGEST]) == content[-_DIGEST:]:
         return True
     warnings.warn(f"{path} was damaged: what it held is compiled again.", DamageWarning, stacklevel=2)
     return False
