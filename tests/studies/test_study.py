@@ -99,7 +99,7 @@ def test_hyperparameters_are_those_of_all_then_those_of_one_algorithm():
             "constraint='LSI' contradicts",
         ),
         ({"group": {"budget": {"quick": 1}}}, "scale 'quick' does not exist"),
-        ({"budget": 3}, "total_timesteps of at least"),
+        ({"budget": 3}, "total_timesteps (--decisions) of at least"),
         ({"budget": "much"}, "budget must be a whole number of at least 1, not 'much'"),
         ({"split": "exam"}, "split 'exam' does not exist"),
         ({"preset": "best"}, "choose one of default, paper"),
