@@ -23,8 +23,9 @@ NEEDS = {
     "maskable_ppo": "sb3_contrib",
     "torchrl_ppo": "torchrl",
     "rllib_ppo": "ray",
+    "cleanrl_ppo": "torch",
 }
-QUICK = ("stable_baselines3_ppo", "stable_baselines3_sac", "stable_baselines3_vector", "maskable_ppo")
+QUICK = ("stable_baselines3_ppo", "stable_baselines3_sac", "stable_baselines3_vector", "maskable_ppo", "cleanrl_ppo")
 
 
 def play(name, arguments, monkeypatch, capsys):
@@ -51,7 +52,7 @@ def assert_survived(said):
 
 
 @pytest.mark.parametrize("name", QUICK)
-def test_trains_with_stable_baselines3(name, monkeypatch, capsys):
+def test_trains_quickly(name, monkeypatch, capsys):
     pytest.importorskip(NEEDS[name])
     assert_survived(play(name, ["--steps", "200"], monkeypatch, capsys))
 
