@@ -70,6 +70,25 @@ def test_a_study_brings_every_finished_cell_under_its_name(tmp_path):
     assert collection.missing == [f"Cell bus14-T0-v0-ppo-idle-3 of the study {tmp_path} is not finished."]
 
 
+def test_a_demonstration_brings_its_run_and_all_that_was_played(tmp_path):
+    write_made_up_run(tmp_path / "run")
+    with pytest.raises(UsageError, match="has no evaluation yet: 'rl2grid demo' goes on"):
+        collect([str(tmp_path)])
+    for agent in ("do-nothing", "PPO"):
+        write_made_up_evaluation(tmp_path / "evaluation" / agent, agent)
+    collection = collect([str(tmp_path)])
+    assert sorted(one.episodes[0].agent for one in collection.evaluations) == ["PPO", "do-nothing"]
+    assert [(run.curve.label, run.folder.name) for run in collection.runs] == [("ppo + idle", "run")]
+    assert collection.missing == []
+    played = collection.evaluations[0].identity["split"]
+    other = "test" if played != "test" else "train"
+    assert len(collect([str(tmp_path)], played).evaluations) == 2
+    with pytest.raises(UsageError, match=f"has no evaluation on {other} yet"):
+        collect([str(tmp_path)], other)
+    with pytest.raises(UsageError, match="has names of its own"):
+        collect([f"mine={tmp_path}"])
+
+
 def test_the_only_scale_of_a_study_is_found(tmp_path):
     write_made_up_study(tmp_path / "quick", [dict(CELLS[0])])
     assert len(collect([str(tmp_path)]).evaluations) == 1

@@ -13,7 +13,7 @@ from rl2grid.records.files import check_own
 from rl2grid.scenarios.splits import SPLITS
 
 THEMES = ("light", "dark")
-SPLIT_HELP = "which evaluations are taken; by default those on validation, and all of a study"
+SPLIT_HELP = "which evaluations are taken; by default those on validation, and all of a study or the demo"
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -22,7 +22,8 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         "folders",
         nargs="+",
         metavar="folder",
-        help="an evaluation, a study, or a run, whose evaluations on --split are taken too; LABEL=FOLDER names it",
+        help="an evaluation, a study, the demonstration, or a run, whose evaluations on --split are taken too; "
+        "LABEL=FOLDER names it",
     )
     parser.add_argument("--output", type=Path, required=True, help="folder of the tables and figures")
     parser.add_argument("--split", default=None, choices=SPLITS, help=SPLIT_HELP)

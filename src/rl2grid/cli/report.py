@@ -25,7 +25,8 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         "folders",
         nargs="+",
         metavar="folder",
-        help="a study, an evaluation, or a run, whose evaluations on --split are taken too; LABEL=FOLDER names it",
+        help="a study, an evaluation, the demonstration, or a run, whose evaluations on --split are taken too; "
+        "LABEL=FOLDER names it",
     )
     parser.add_argument("--output", type=Path, default=Path("report"), help="folder of the page")
     parser.add_argument("--split", default=None, choices=SPLITS, help=SPLIT_HELP)

@@ -5,6 +5,7 @@ A folder is one of
 - an evaluation, as ``rl2grid evaluate`` writes it;
 - a run, as ``rl2grid train`` writes it; the evaluations below it are taken too;
 - a folder with evaluations in ``evaluation/``, such as that of an agent without training;
+- what ``rl2grid demo`` writes: the run in ``run/`` and all evaluations in ``evaluation/``;
 - a study, as ``rl2grid study run`` writes it: the run and the evaluation of every finished cell; or one of its cells.
 """
 
@@ -48,7 +49,7 @@ def collect(folders: Sequence[str], split: str | None = None) -> Collection:
 
     Args:
         folders: each ``FOLDER`` or ``LABEL=FOLDER``; the label is what tables and figures call it.
-        split: whose evaluations are taken; None: validation, and of a study those that it made.
+        split: whose evaluations are taken; None: validation, and of a study or a demonstration those that it made.
 
     Raises:
         UsageError: a folder that holds nothing of the kind, or from which something is missing.
@@ -65,6 +66,8 @@ def collect(folders: Sequence[str], split: str | None = None) -> Collection:
             _add_study(collection, study, split)
         elif (cell := read_cell(folder)) is not None:
             _add_cell(collection, folder, cell, label)
+        elif is_run(folder / RUN_FOLDER):
+            _add_demonstration(collection, folder, label, split)
         else:
             _add_folder(collection, folder, label, split or VALIDATION)
     return collection
@@ -120,6 +123,18 @@ def _add_folder(collection: Collection, folder: Path, label: str | None, split: 
             f"{folder} holds neither a run nor a study nor an evaluation on {split}: give folders that "
             "'rl2grid train', 'rl2grid study run' or 'rl2grid evaluate' wrote."
         )
+
+
+def _add_demonstration(collection: Collection, folder: Path, label: str | None, split: str | None) -> None:
+    if label is not None:
+        raise UsageError(f"A demonstration has names of its own: give {folder} without {label}=.")
+    evaluations = [load_evaluation(path) for path in _evaluations_below(folder, "")]
+    taken = [result for result in evaluations if split in (None, result.identity["split"])]
+    if not taken:
+        wanted = "evaluation" if split is None else f"evaluation on {split}"
+        raise UsageError(f"The demonstration {folder} has no {wanted} yet: 'rl2grid demo' goes on with it.")
+    collection.evaluations += taken
+    collection.runs.append(read_training_run(folder / RUN_FOLDER))
 
 
 def _study_folder(folder: Path) -> Path | None:
