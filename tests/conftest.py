@@ -1,9 +1,14 @@
 """What all tests share."""
 
+import os
+
 import pytest
 from grid2op_copies import made_once
 
+from rl2grid.compile_notices import VARIABLE
 from rl2grid.engines.reference import engine
+
+os.environ[VARIABLE] = "1"  # what commands print is compared, whether or not something was compiled before
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -16,7 +16,10 @@ from typing import Any, TypeVar, cast
 import numba
 import platformdirs
 
+from rl2grid import compile_notices
 from rl2grid.compiled_files import verify_files_of
+
+compile_notices.install()
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 

@@ -91,7 +91,15 @@ def test_a_failed_cell_is_told_and_the_others_are_finished(capsys, file: str, tm
     monkeypatch.setattr("rl2grid.studies.backends.make_backend", lambda *_: Backend())
     output = tmp_path / "out"
     assert main(["study", "run", file, "--output", str(output)]) == 1
-    shown = capsys.readouterr().out
+    captured = capsys.readouterr()
+    course = captured.err.splitlines()  # nobody looks: a line for whatever changes
+    assert course[0].startswith("few (quick): 2 cells, 0 done")
+    assert any(line.endswith(": done, survival 0.500") for line in course)
+    assert any(
+        line.endswith(" failed: MemoryError: no more") or line.endswith(": failed: MemoryError: no more")
+        for line in course
+    )
+    shown = captured.out
     assert "2 cells, 1 done, 0 running, 1 failed" in shown
     assert "MemoryError: no more" in shown
     assert "1 cells failed" in shown

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import shutil
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from rl2grid.compile_notices import VARIABLE
 
 if TYPE_CHECKING:
     from rich.progress import Progress, ProgressColumn
@@ -27,6 +30,8 @@ class Output:
 
     def __init__(self, *, json: bool = False, quiet: bool = False) -> None:
         self.json, self.quiet = json, quiet
+        if quiet:  # for the processes that it starts, too
+            os.environ.setdefault(VARIABLE, "1")
         self._results: dict[str, Any] = {}
 
     @property

@@ -13,7 +13,10 @@ import pickle
 import subprocess
 import sys
 import traceback
-from typing import Any, BinaryIO
+from collections.abc import Callable
+from typing import IO, Any, BinaryIO
+
+import cloudpickle
 
 from rl2grid.envs.local_rows import LocalRows
 from rl2grid.envs.options import TaskOptions
@@ -37,13 +40,17 @@ class Worker:
             stdout=subprocess.PIPE,
             env=environment,
         )
-        self.send("make", own_systems(), task, options, n)
+        # A reward may be a function of the caller's script, which this process does not import.
+        self._write(lambda stream: cloudpickle.dump(("make", (own_systems(), task, options, n)), stream))
 
     def send(self, method: str, *arguments: Any) -> None:
         """Ask for ``method(*arguments)`` without waiting."""
+        self._write(lambda stream: pickle.dump((method, arguments), stream, pickle.HIGHEST_PROTOCOL))
+
+    def _write(self, dump: Callable[[IO[bytes]], None]) -> None:
         assert self._process.stdin is not None
         try:
-            pickle.dump((method, arguments), self._process.stdin, pickle.HIGHEST_PROTOCOL)
+            dump(self._process.stdin)
             self._process.stdin.flush()
         except BrokenPipeError:
             raise self._death() from None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
@@ -12,8 +13,12 @@ from rich.table import Table
 from rich.text import Text
 
 from rl2grid.analysis.table import Cell, Column, ResultTable
+from rl2grid.records.logs import LOG_FILE
 from rl2grid.studies.cells import Study
 from rl2grid.studies.states import CellState, State
+
+_LINE_SECONDS = 60.0
+"""Without a terminal it is said how far a study is when nothing was said for this long."""
 
 
 def study_table(study: Study, states: Sequence[CellState], remaining: float | None) -> RenderableType:
@@ -87,11 +92,51 @@ def _duration(seconds: float) -> str:
     return f"{hours} h {minutes:02d} min" if hours < 48 else f"{hours / 24:.0f} days"
 
 
+Show = Callable[[Sequence[CellState], float | None], None]
+"""To be called with the states of all cells and the seconds that are left, if that is known."""
+
+
 @contextmanager
-def live_display(console: Console | None) -> Iterator[Callable[[Callable[[], RenderableType]], None]]:
-    """What to call with what is to be shown."""
-    if console is None or not console.is_terminal:
-        yield lambda make: None
-        return
-    with Live(console=console, auto_refresh=False, transient=False) as live:
-        yield lambda make: live.update(make(), refresh=True)
+def study_display(study: Study, console: Console | None) -> Iterator[Show]:
+    """What to call whenever something may have changed: a table in a terminal, elsewhere a line for each change."""
+    if console is None:
+        yield lambda states, remaining: None
+    elif console.is_terminal:
+        with Live(console=console, auto_refresh=False, transient=False) as live:
+            yield lambda states, remaining: live.update(study_table(study, states, remaining), refresh=True)
+    else:
+        yield _Lines(study, console).show
+
+
+class _Lines:
+    """The course of a study as lines: what is begun, how far it is every minute, what has ended."""
+
+    def __init__(self, study: Study, console: Console) -> None:
+        self._study, self._console = study, console
+        self._known: dict[str, str] = {}
+        self._told = time.monotonic()
+
+    def show(self, states: Sequence[CellState], remaining: float | None) -> None:
+        """Say what has changed."""
+        changed = [state for state in states if self._known.get(state.cell.name) != state.state]
+        first = not self._known
+        self._known |= {state.cell.name: str(state.state) for state in states}
+        if first:
+            self._say(headline(self._study, states, remaining))
+        for state in changed:
+            if state.state != State.WAITING and not (first and state.state == State.DONE):
+                self._say(f"{state.cell.name}: {_news(state)}")
+        if time.monotonic() - self._told >= _LINE_SECONDS:
+            self._say(headline(self._study, states, remaining))
+
+    def _say(self, words: str) -> None:
+        self._told = time.monotonic()
+        self._console.print(words, soft_wrap=True, highlight=False, markup=False)
+
+
+def _news(state: CellState) -> str:
+    if state.state == State.RUNNING:
+        return f"begun; {state.folder / LOG_FILE} says more, such as what is compiled"
+    if state.state == State.FAILED:
+        return f"failed: {state.error}"
+    return str(state.state) if state.result is None else f"{state.state}, survival {state.result.survival:.3f}"

@@ -11,7 +11,7 @@ may be killed: a cell belongs to the process that holds its lock, and is finishe
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from rich.console import Console
@@ -31,7 +31,7 @@ from rl2grid.records.versions import library_versions
 from rl2grid.studies.backends import Backend, Job
 from rl2grid.studies.cell import BUSY, FINISHED, REFUSED, STOPPED, commands, last_error, prepare
 from rl2grid.studies.cells import Study
-from rl2grid.studies.progress import live_display, study_table
+from rl2grid.studies.progress import study_display
 from rl2grid.studies.states import CellState, State, look, read_states
 from rl2grid.training.interrupts import stop_requests
 
@@ -60,13 +60,15 @@ def run_study(study: Study, backend: Backend, console: Console | None = None) ->
     for cell in study.cells:
         prepare(study.folder(cell), cell)
     runner = _Runner(study, backend)
-    with stop_requests() as stop, live_display(console) as show:
+    with stop_requests() as stop, study_display(study, console) as show:
         while not stop.is_set() and runner.step():
-            show(lambda: study_table(study, runner.states, runner.remaining_seconds()))
+            show(runner.states, runner.remaining_seconds())
             stop.wait(_POLL_SECONDS)
         if stop.is_set():
-            runner.stop(lambda: show(lambda: "Stopping: the cells write their checkpoints."))
-        show(lambda: study_table(study, runner.states, None))
+            if console is not None:
+                console.print("Stopping: the cells write their checkpoints.")
+            runner.stop()
+        show(runner.states, None)
     runner.record()
     if stop.is_set():
         raise KeyboardInterrupt
@@ -114,12 +116,11 @@ class _Runner:
                 self._submit(number, state)
         return any(state.state in (State.WAITING, State.RUNNING) for state in self.states)
 
-    def stop(self, show: Callable[[], None]) -> None:
+    def stop(self) -> None:
         """Let all cells write their checkpoints and end."""
         for job in self._jobs.values():
             job.stop()
         while self._jobs:
-            show()
             for number, job in list(self._jobs.items()):
                 status = job.poll()
                 if status is not None and not is_locked(self.states[number].folder):
