@@ -15,6 +15,7 @@ from rl2grid.mdp.rewards import (
     paper_components,
     released_components,
     resolve_reward,
+    reward_name,
 )
 from rl2grid.mdp.state import new_state
 
@@ -247,16 +248,44 @@ def plain(state, i):
     return 1.0, 0.0, 0.0
 
 
+class Margin:
+    """A reward that is an object."""
+
+    def __call__(self, state, i):
+        return 1.0 - state.rho[i].max()
+
+
 @numba.njit
 def of_one_argument(state):
     return 1.0, 0.0, 0.0
 
 
-@pytest.mark.parametrize("function", [plain, of_one_argument])
-def test_an_unusable_function_is_refused(function, monkeypatch):
-    monkeypatch.setattr(numba.config, "DISABLE_JIT", 0)
-    with pytest.raises(UsageError, match=rf"'{function.__name__}' is not usable: compile .* numba.njit, or choose one"):
+def of_three_arguments(state, i, more):
+    return 1.0, 0.0, 0.0
+
+
+def test_plain_python_is_taken_too(calm):
+    state = calm(load_grid("bus14"))
+    assert resolve_reward(plain).components(state, 0) == (1.0, 0.0, 0.0)
+    assert resolve_reward(Margin()).components(state, 0) == (0.5, 0.0, 0.0)
+    assert reward_name(plain).endswith("test_rewards.plain")
+    assert reward_name(Margin()).endswith("test_rewards.Margin")
+
+
+@pytest.mark.parametrize("function", [of_one_argument, of_three_arguments, type])
+def test_an_unusable_function_is_refused(function):
+    with pytest.raises(
+        UsageError, match=rf"'{function.__name__}' is not usable: give a function \(state, i\) .*choose"
+    ):
         resolve_reward(function)
+
+
+@pytest.mark.parametrize("result", [(1.0, 2.0), "three", None, (1.0, 2.0, "x")])
+def test_a_wrong_result_is_refused_in_one_sentence(result, calm):
+    reward = resolve_reward(lambda state, i: result)
+    with pytest.raises(UsageError, match="it is to return three numbers") as error:
+        reward.components(calm(load_grid("bus14")), 0)
+    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(

@@ -51,7 +51,7 @@ class TaskOptions:
         metadata={"flag": "default, paper or released, or the weights of the three components, such as 1,0.5,0"},
     )
     """A preset (``"default"``, ``"paper"``, ``"released"``), the weights of the three default components,
-    or a compiled function ``(state, i) -> (survive, overload, cost)``."""
+    or a function ``(state, i) -> (survive, overload, cost)``, compiled by Numba or plain Python."""
     split: str = field(default="train", metadata=_one_of(*SPLITS))
     """Which scenarios are played: ``"train"`` (months without end), ``"validation"`` or ``"test"`` (20 months each), or
     ``"bundled"``, the series inside the Grid2Op wheel."""

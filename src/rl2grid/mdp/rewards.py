@@ -1,4 +1,4 @@
-r"""Rewards of a grid step: presets, weights on the default components, or a compiled function of your own.
+r"""Rewards of a grid step: presets, weights on the default components, or a function of your own.
 
 A reward is ``weights . (survive, overload, cost)`` (paper, Section 3.1). With L the lines, ``rho`` the
 loading of a line, ``losses = sum(gen_p) - sum(load_p)``, ``c`` the cost per MWh of the dearest generator that
@@ -31,10 +31,10 @@ larger than those ranges, both terms are saturated most of the time:
 - cost = -c (losses + 5 sum|actual_dispatch| + sum|storage_power|) / (5.05 c_max sum(gen_pmax)): Grid2Op's
   ``RedispReward`` divided by its largest regret; -1 at a game over and after an illegal or ambiguous action
 
-A function of your own is compiled with ``numba.njit``, reads row ``i`` of a
-:class:`~rl2grid.mdp.state.GridState` and returns the three components, which are added up as they are::
+A function of your own reads row ``i`` of a :class:`~rl2grid.mdp.state.GridState` after every grid step and returns the
+three components, which are added up as they are, or one number, which is the first of them. It may be plain Python, or
+compiled with ``numba.njit``, which is faster where it has loops::
 
-    @numba.njit
     def fewer_switches(state, i):
         return 1.0, 0.0, -0.01 * np.sum(state.topo_vect[i] != 1)
 """
@@ -47,7 +47,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numba
 import numpy as np
 
 from rl2grid.arrays import F32, Flags
@@ -65,7 +64,7 @@ class RewardFunction:
 
     name: str
     components: Callable[[GridState, int], Components]
-    """Compiled ``(state, i) -> (survive, overload, cost)``."""
+    """``(state, i) -> (survive, overload, cost)``; those of the package are compiled."""
     weights: Components
     """Weights of the three components in the reward."""
 
@@ -135,8 +134,9 @@ def resolve_reward(spec: str | Sequence[float] | Callable[..., Any]) -> RewardFu
     """The reward that ``spec`` asks for.
 
     Args:
-        spec: a name in :data:`PRESETS`; or the weights of the three default components; or a function
-            ``(state, i) -> (survive, overload, cost)`` compiled with ``numba.njit``, whose components are added up.
+        spec: a name in :data:`PRESETS`; or the weights of the three default components; or a function ``(state, i)``,
+            compiled with ``numba.njit`` or not, that returns (survive, overload, cost), which are added up, or one
+            number.
 
     Raises:
         UsageError: ``spec`` is none of these.
@@ -151,14 +151,39 @@ def resolve_reward(spec: str | Sequence[float] | Callable[..., Any]) -> RewardFu
 
 def _custom(function: Callable[..., Any]) -> RewardFunction:
     name = getattr(function, "__name__", type(function).__name__)
-    compiled = numba.extending.is_jitted(function) or numba.config.DISABLE_JIT
-    source = getattr(function, "py_func", function)
-    if not compiled or len(inspect.signature(source).parameters) != 2:
+    try:
+        inspect.signature(getattr(function, "py_func", function)).bind(None, 0)
+    except (TypeError, ValueError):
         raise UsageError(
-            f"Reward function {name!r} is not usable: compile a function (state, i) -> (survive, overload, cost) "
-            f"with numba.njit, or choose one of {', '.join(PRESETS)}."
-        )
-    return RewardFunction(name, function, (1.0, 1.0, 1.0))
+            f"Reward function {name!r} is not usable: give a function (state, i) -> (survive, overload, cost), or "
+            f"choose one of {', '.join(PRESETS)}."
+        ) from None
+    return RewardFunction(name, _checked(function, name), (1.0, 1.0, 1.0))
+
+
+def reward_name(function: Callable[..., Any]) -> str:
+    """What stored results call a function that somebody gave as reward: where it is written."""
+    source = function if hasattr(function, "__qualname__") else type(function)
+    return f"{source.__module__}.{source.__qualname__}"
+
+
+def _checked(function: Callable[..., Any], name: str) -> Callable[[GridState, int], Components]:
+    """The function, whose result is seen to be three numbers, or one."""
+
+    def components(state: GridState, i: int) -> Components:
+        result = function(state, i)
+        try:
+            if np.ndim(result) == 0:
+                return float(result), 0.0, 0.0
+            survive, overload, cost = result
+            return float(survive), float(overload), float(cost)
+        except (TypeError, ValueError):
+            raise UsageError(
+                f"Reward function {name!r} returned {result!r}: it is to return three numbers (survive, overload, "
+                "cost), or one."
+            ) from None
+
+    return components
 
 
 def _weights(spec: object) -> Components:
@@ -167,7 +192,7 @@ def _weights(spec: object) -> Components:
     if len(numbers) != 3 or len(valid) != 3 or not all(map(math.isfinite, valid)):
         raise UsageError(
             f"Reward {spec!r} does not exist: choose one of {', '.join(PRESETS)}, three finite weights of the default "
-            "components, or a function compiled with numba.njit."
+            "components, or a function (state, i)."
         )
     return valid[0], valid[1], valid[2]
 
