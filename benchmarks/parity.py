@@ -51,7 +51,8 @@ from rl2grid.envs.description import single_spaces
 from rl2grid.envs.tasks import find_task
 from rl2grid.grids import GRID_IDS, Grid, load_grid
 from rl2grid.mdp.actions import StepAction, inject, legal_actions, level_catalogue
-from rl2grid.mdp.features import observation_size, observation_writer, physical_scale
+from rl2grid.mdp.features import observation_size, physical_scale
+from rl2grid.mdp.observations import observation_writer
 from rl2grid.mdp.rewards import PRESETS
 from rl2grid.mdp.state import GridState
 from rl2grid.records.files import write_text

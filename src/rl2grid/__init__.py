@@ -74,7 +74,7 @@ def train(
         task: The task or its id; the namespace and the version of an id may be left out.
         folder: Where the run is written, a folder that does not exist yet; None: ``runs/<task>-<algorithm>-<seed>``.
         preset: Where the hyperparameters come from that are not given.
-        hyperparameters: Of the algorithm, such as ``{"total_timesteps": 100_000, "seed": 1}``.
+        hyperparameters: Of the algorithm, such as ``{"total_timesteps": 100_000, "seed": 1}`` (decisions to train for).
         validation_months: How many validation months pick the best policy; None: all, 0: none.
         evaluate_every: Decisions between two validations; there is one more at the end.
         progress: Whether to show a progress bar.

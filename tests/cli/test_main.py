@@ -179,7 +179,7 @@ def test_help_of_training_lists_hyperparameters_with_their_meaning(capsys):
 
 
 def test_works_as_a_module_and_says_its_version():
-    command = [sys.executable, "-m", "rl2grid.cli", "--version"]
+    command = [sys.executable, "-m", "rl2grid", "--version"]
     assert subprocess.run(command, capture_output=True, text=True, check=True).stdout.startswith("rl2grid 0.")
 
 

@@ -18,7 +18,8 @@ from rl2grid.engines.native.entry import reset_one
 from rl2grid.errors import UsageError
 from rl2grid.grids import GRID_IDS, load_grid
 from rl2grid.mdp.actions import DO_NOTHING, StepAction, full_catalogue, inject, move, switch
-from rl2grid.mdp.features import observation_size, observation_writer
+from rl2grid.mdp.features import observation_size
+from rl2grid.mdp.observations import observation_writer
 from rl2grid.mdp.state import OBSERVED, OBSERVED_STORAGE
 from rl2grid.mdp.termination import GameOver
 from rl2grid.powerflow.model import load_network

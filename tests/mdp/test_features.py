@@ -5,7 +5,8 @@ import pytest
 
 from rl2grid.errors import UsageError
 from rl2grid.grids import GRID_IDS, load_grid
-from rl2grid.mdp.features import feature_slices, observation_size, observation_writer, physical_scale
+from rl2grid.mdp.features import feature_slices, observation_size, physical_scale
+from rl2grid.mdp.observations import observation_writer
 
 SHARED = ["t", "gen_p", "gen_theta", "load_p", "load_theta", "rho", "time_before_cooldown_line"]
 SPECIFIC = {

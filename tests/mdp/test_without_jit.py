@@ -14,7 +14,7 @@ from random_states import random_state
 from rl2grid.grids import load_grid
 from rl2grid.mdp.accumulate import accrue, begin_episode, begin_transition
 from rl2grid.mdp.constraints import lsi_cost, tlo_cost, update_excused
-from rl2grid.mdp.features import observation_size, observation_writer
+from rl2grid.mdp.features import observation_size
 from rl2grid.mdp.heuristics import (
     careful_candidate,
     is_careful_enough,
@@ -24,6 +24,7 @@ from rl2grid.mdp.heuristics import (
     remember_move,
     remember_topology,
 )
+from rl2grid.mdp.observations import observation_writer
 from rl2grid.mdp.rewards import PRESETS
 from rl2grid.mdp.scores import margin_score, overload_score, topology_score
 from rl2grid.mdp.termination import game_over_reason

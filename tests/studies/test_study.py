@@ -276,7 +276,7 @@ heuristics = ["idle"]
 
 
 def start(tmp_path: Path, output: str) -> subprocess.Popen[bytes]:
-    command = [sys.executable, "-m", "rl2grid.cli", "study", "run", "killed.toml", "--output", output]
+    command = [sys.executable, "-m", "rl2grid", "study", "run", "killed.toml", "--output", output]
     return subprocess.Popen(command, cwd=tmp_path, env=environment(), stdout=subprocess.DEVNULL)
 
 

@@ -13,10 +13,11 @@ from rl2grid.engines.worlds import World, world_of_plain
 from rl2grid.envs.description import check_action
 from rl2grid.envs.info import batch_info
 from rl2grid.envs.options import TaskOptions
+from rl2grid.envs.row_view import RowView, public_names
 from rl2grid.envs.rows import Batch
 from rl2grid.envs.task_environments import StreamPosition, TaskEnvironments
 from rl2grid.envs.tasks import Task
-from rl2grid.errors import UsageError
+from rl2grid.errors import UsageError, one_of
 from rl2grid.mdp.features import observation_size
 from rl2grid.scenarios.episodes import EpisodePlan
 
@@ -102,6 +103,16 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
         # A copy: the array was handed out with the infos of the last step.
         self._shown_effects = self._shown_effects.copy()
         self._shown_effects[i] = self.transitions.action_effects[i]
+
+    def ask(self, name: str, arguments: tuple[Any, ...], keywords: dict[str, Any]) -> list[Any]:
+        """See :meth:`rl2grid.envs.rows.Rows.ask`."""
+        if name not in public_names():
+            raise one_of("Method or attribute of a row", name, public_names())
+        answers = []
+        for i in range(self._n):
+            found = getattr(RowView(self, i), name)
+            answers.append(found(*arguments, **keywords) if callable(found) else found)
+        return answers
 
     def _effect(self, i: int) -> str:
         return str(self._shown_effects[i])

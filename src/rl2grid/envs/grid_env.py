@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from datetime import datetime
 from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium
@@ -13,19 +11,19 @@ from numpy.typing import NDArray
 from rl2grid.engines.transition import Listener
 from rl2grid.engines.worlds import World
 from rl2grid.envs.closed import closed
-from rl2grid.envs.description import TaskDescription, single_spaces
+from rl2grid.envs.description import single_spaces
 from rl2grid.envs.options import keyword_names, options_of, shows_options
-from rl2grid.envs.task_environments import SimulationResult, TaskEnvironments
+from rl2grid.envs.row_view import RowMethods
+from rl2grid.envs.task_environments import TaskEnvironments
 from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError, one_of
 from rl2grid.mdp.state import GridState
 
 if TYPE_CHECKING:
     from rl2grid.drawing.grid_drawing import FrameRenderer
-    from rl2grid.engines.native.what_if import ActionOutcomes, OutageOutcomes
 
 
-class PowerGridEnv(gymnasium.Env[NDArray[np.float32], Any], TaskDescription):
+class PowerGridEnv(RowMethods, gymnasium.Env[NDArray[np.float32], Any]):
     """Keep a transmission grid alive for a month of 5-minute steps.
 
     ## Description
@@ -42,7 +40,8 @@ class PowerGridEnv(gymnasium.Env[NDArray[np.float32], Any], TaskDescription):
     | `R` | `Box(-1, 1, (n,), float32)` | redispatch (share of the ramp of a step), curtailment (limit = 1 + min(a, 0)), storage (share of the maximum power); zero does nothing |
 
     ## Observation space
-    `Box(-inf, inf, (n,), float32)`. `observation_slices` maps each name to its place.
+    `Box(-inf, inf, (n,), float32)`. `observation_slices` maps each name to its place; `observe()` gives the present
+    values by name, in these units.
 
     | feature | size | unit | in |
     |---|---|---|---|
@@ -141,78 +140,6 @@ class PowerGridEnv(gymnasium.Env[NDArray[np.float32], Any], TaskDescription):
         ended = bool(played.state.terminated[0]), bool(played.state.truncated[0])
         return self._observation(), played.reward(0), *ended, played.info(0)
 
-    def simulate(self, action: Any, horizon: int = 1) -> SimulationResult:
-        """What ``action`` would bring on the forecast ``horizon`` steps ahead; the state stays untouched.
-
-        One grid step is played, without opponent and heuristic; ``docs/simulate.md`` says what happens to
-        maintenance, cooldowns, counters, storage and dispatch.
-
-        Raises:
-            UsageError: a wrong action or horizon, no forecast for it, or no episode in progress.
-        """
-        return self._environments.simulate(0, action, horizon)
-
-    def what_if(self, actions: Sequence[int] | None = None) -> ActionOutcomes:
-        """What each topology action would do to the loadings of the next step, by its forecast, in one call.
-
-        The power flow is that of ``simulate`` before protections trip lines; see ``docs/what_if.md``.
-
-        Args:
-            actions: ids of those to try; all of the task if left out.
-
-        Returns:
-            Arrays of one entry per action: ``worst_loading`` (infinite where no flow is found), ``verdict``,
-            ``overloads`` and ``legal``.
-
-        Raises:
-            UsageError: continuous actions, an action that does not exist, no episode in progress, or the reference
-                engine.
-        """
-        return self._environments.what_if(0, actions)
-
-    def security(self, action: int | None = None) -> OutageOutcomes:
-        """What the loss of each line would do (N-1), in one call; see ``docs/what_if.md``.
-
-        Args:
-            action: the topology action after which lines are lost, in the next step, by its forecast; None: they are
-                lost now, with the present injections.
-
-        Returns:
-            Arrays of one entry per line: ``worst_loading``, ``verdict``, ``overloads`` and ``was_open``. Cooldowns do
-            not count.
-
-        Raises:
-            UsageError: continuous actions, an action that does not exist, no episode in progress, or the reference
-                engine.
-        """
-        return self._environments.security(0) if action is None else self._environments.security_after(0, action)
-
-    def n_minus_1_score(self) -> float:
-        """Share of the lines in service whose loss would leave neither an overload nor a collapse.
-
-        Raises:
-            UsageError: no episode in progress, or the reference engine.
-        """
-        return self._environments.n_minus_1_score(0)
-
-    @property
-    def imagined(self) -> bool:
-        """Whether an imagined world is played."""
-        return bool(self._environments.imagined[0])
-
-    @property
-    def foresight(self) -> int:
-        """Decisions of the running episode taken where its truth had been seen before; see ``docs/worlds.md``."""
-        return int(self._environments.foresight[0])
-
-    def save(self) -> World:
-        """Everything of the environment at this moment; see ``docs/worlds.md``.
-
-        Raises:
-            UsageError: the environment was not reset yet.
-        """
-        return self._environments.save(0)
-
     def restore(self, world: World) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """Go on from where ``world`` was saved: what follows is what followed there, bit for bit.
 
@@ -227,39 +154,8 @@ class PowerGridEnv(gymnasium.Env[NDArray[np.float32], Any], TaskDescription):
         self._last_action = None
         return self._observation(), self._environments.info(0)
 
-    def imagine(self, seed: int) -> World:
-        """A world that goes on from here as far as an operator may know; see ``docs/worlds.md``.
-
-        The environment stays where it is; ``restore`` the world to play it, in this environment or in another one.
-
-        Args:
-            seed: of the opponent's draws.
-
-        Raises:
-            UsageError: there is no episode in progress, or the seed is negative; or the reference engine plays.
-        """
-        return self._environments.imagine(0, seed)
-
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_renderer": None}  # made again when it is needed
-
-    def action_masks(self) -> NDArray[np.bool_]:
-        """Which discrete actions are legal now, bool [action].
-
-        Raises:
-            UsageError: the task has continuous actions.
-        """
-        mask = np.zeros(self.task.n_actions, np.bool_)
-        self._environments.write_action_mask(0, mask)
-        return mask
-
-    def clock_at(self, step: int) -> datetime:
-        """The time in the scenario after ``step`` steps of the episode.
-
-        Raises:
-            UsageError: the environment was not reset yet.
-        """
-        return self._environments.clock(0, step)
 
     def render(self) -> NDArray[np.uint8]:  # type: ignore[override]
         """The grid and what the agent did last as a picture, uint8 [720, 1280, 3].

@@ -75,6 +75,10 @@ class RemoteRows:
         """See :meth:`rl2grid.envs.rows.Rows.load_state_dict`."""
         return self._together(self._ask("load_state_dict", [(rows[part],) for part in self._parts]))
 
+    def ask(self, name: str, arguments: tuple[Any, ...], keywords: dict[str, Any]) -> list[Any]:
+        """See :meth:`rl2grid.envs.rows.Rows.ask`."""
+        return [row for part in self._ask("ask", [(name, arguments, keywords)] * len(self._parts)) for row in part]
+
     def close(self) -> None:
         """End the processes."""
         for worker in self._workers:

@@ -94,5 +94,12 @@ class Rows(Protocol):
     def load_state_dict(self, rows: list[dict[str, Any]]) -> Batch:
         """Bring every row to where it was saved; the observations and infos are those of then."""
 
+    def ask(self, name: str, arguments: tuple[Any, ...], keywords: dict[str, Any]) -> list[Any]:
+        """What is called ``name`` of the :class:`~rl2grid.envs.row_view.RowView` of every row, called if it can be.
+
+        Raises:
+            UsageError: there is no such thing, or it refuses.
+        """
+
     def close(self) -> None:
         """Free the simulators and end the processes."""

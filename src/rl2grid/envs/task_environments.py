@@ -28,9 +28,10 @@ from rl2grid.mdp.actions import (
     level_catalogue,
     validate_continuous,
 )
-from rl2grid.mdp.features import observation_size, observation_writer, physical_scale
+from rl2grid.mdp.features import feature_slices, observation_size, physical_scale
 from rl2grid.mdp.legality import verdict_on
-from rl2grid.mdp.rewards import resolve_reward
+from rl2grid.mdp.observations import observation_writer
+from rl2grid.mdp.rewards import resolve_reward, reward_name
 from rl2grid.mdp.state import GridState
 from rl2grid.scenarios.episodes import EpisodePlan, plan_episode
 from rl2grid.scenarios.library import load_scenario
@@ -155,6 +156,16 @@ class TaskEnvironments:
     def write_observation(self, i: int, out: NDArray[np.float32]) -> None:
         """Write the observation of row ``i`` to ``out``, float32 [feature]."""
         self._observe(self.state, i, out)
+
+    def observe(self, i: int, scaled: bool) -> dict[str, NDArray[np.float32]]:
+        """The observation of row ``i`` by name; see :meth:`rl2grid.envs.row_view.RowMethods.observe`."""
+        self._position(i)
+        values = np.zeros(observation_size(self.grid, self.task.kind), np.float32)
+        if scaled:
+            self.write_observation(i, values)
+        else:
+            self._write_observation(self.state, i, values)
+        return {name: values[part] for name, part in feature_slices(self.grid, self.task.kind).items()}
 
     def reward(self, i: int) -> float:
         """Sum of the rewards of the last transition."""
@@ -413,7 +424,7 @@ def _rebuild(
 
 
 def _in_words(value: Any) -> str:
-    return f"{value.__module__}.{value.__qualname__}" if callable(value) else repr(value)
+    return reward_name(value) if callable(value) else repr(value)
 
 
 def _start_info(plan: EpisodePlan) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from rl2grid.envs.closed import closed
 from rl2grid.envs.description import TaskDescription, single_spaces
 from rl2grid.envs.making_rows import make_rows
 from rl2grid.envs.options import keyword_names, options_of, shows_options
+from rl2grid.envs.row_view import public_names
 from rl2grid.envs.rows import Batch
 from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
@@ -65,6 +66,7 @@ class PowerGridVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], Any, ND
         self.single_observation_space, self.single_action_space = single_spaces(self.task)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
+        self._attributes: dict[str, tuple[Any, ...]] = {}
         self._rows = make_rows(self.task, self.options, num_envs, num_threads=num_threads, num_workers=num_workers)
 
     def reset(  # type: ignore[override]
@@ -126,6 +128,45 @@ class PowerGridVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], Any, ND
                 reference engine plays.
         """
         return self._rows.imagine(self._row(i), seed)
+
+    def observe(self, scaled: bool = False) -> dict[str, NDArray[np.float32]]:
+        """The observations of this moment by name, float32 [environment, entry].
+
+        See :meth:`rl2grid.envs.row_view.RowMethods.observe`.
+        """
+        rows = self._rows.ask("observe", (scaled,), {})
+        return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """A method of every environment, called, or an attribute; those of :class:`~rl2grid.envs.row_view.RowView`.
+
+        Raises:
+            UsageError: there is none of that name, or it refuses what it is asked.
+        """
+        if name in self._attributes:
+            return self._attributes[name]
+        return tuple(self._rows.ask(name, args, kwargs))
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """An attribute of every environment: one of ``call``, or one that ``set_attr`` has set."""
+        return self.call(name)
+
+    def set_attr(self, name: str, values: list[Any] | tuple[Any, ...] | Any) -> None:
+        """Keep an attribute of every environment, for who reads it with ``get_attr``.
+
+        Args:
+            name: not one that environments have: they are as they were made.
+            values: a list or tuple with one for each, or one for all.
+
+        Raises:
+            UsageError: environments have that attribute, or there are not as many values as environments.
+        """
+        if name in public_names() or hasattr(type(self), name):
+            raise UsageError(f"Attribute {name!r} cannot be set: make the vector with the keywords that it is to have.")
+        each = tuple(values) if isinstance(values, list | tuple) else (values,) * self.num_envs
+        if len(each) != self.num_envs:
+            raise UsageError(f"{len(each)} values were given for {self.num_envs} environments: give one each.")
+        self._attributes[name] = each
 
     def state_dict(self) -> dict[str, Any]:
         """Where every environment is: the plain forms of their worlds."""

@@ -25,7 +25,7 @@ from rl2grid.evaluation.agents import make_agent
 from rl2grid.evaluation.crew import Job, Setting, make_crew
 from rl2grid.evaluation.progress import show_progress, watch_making
 from rl2grid.mdp.actions import action_set_hash
-from rl2grid.mdp.rewards import resolve_reward
+from rl2grid.mdp.rewards import resolve_reward, reward_name
 from rl2grid.records.episodes import Episode
 from rl2grid.records.evaluation_folder import open_store
 from rl2grid.records.evaluations import Evaluation, labels
@@ -230,7 +230,7 @@ def question(task: Task, keywords: Mapping[str, Any], start: int, scenarios: Seq
     """
     options = asdict(TaskOptions(**keywords))
     reward = options["reward"]
-    options["reward"] = f"{reward.__module__}.{reward.__qualname__}" if callable(reward) else reward
+    options["reward"] = reward_name(reward) if callable(reward) else reward
     return {
         **{key: value for key, value in options.items() if key not in ("scenario", "gamma")},
         "constraint": constraint_of(task, options["constraint"]),

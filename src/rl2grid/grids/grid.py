@@ -219,7 +219,7 @@ def grid_from_record(record: dict[str, Any], digest: str | None = None) -> Grid:
         record: the values.
         digest: its :attr:`Grid.hash`; None: that of the values.
     """
-    hints = get_type_hints(Grid)
+    hints = _hints()
     values: dict[str, Any] = {}
     for field in fields(Grid):
         value, hint = record[field.name], hints[field.name]
@@ -235,6 +235,11 @@ def grid_from_record(record: dict[str, Any], digest: str | None = None) -> Grid:
     if digest is not None:
         vars(grid)["hash"] = digest
     return grid
+
+
+@functools.cache
+def _hints() -> dict[str, Any]:
+    return get_type_hints(Grid)
 
 
 def _tuples(value: Any) -> Any:

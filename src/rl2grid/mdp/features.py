@@ -30,6 +30,8 @@ feature                                                 unit      tasks  shift s
 ``storage_theta``                                       degrees   T R    0     180
 ======================================================= ========= ====== ===== ====================================
 
+What writes them is :mod:`rl2grid.mdp.observations`: this table compiles nothing.
+
 The storage features exist where the grid has storage. The longest cooldown of a line is what a switch, a
 protection, an attack or a day's maintenance can set. Where the constant of an element is 0 (a generator
 without ramp, a load that is always 0, a rule without cooldown) the scale is 1: the entry stays in its unit.
@@ -38,17 +40,14 @@ without ramp, a load that is always 0, a rule without cooldown) the scale is 1: 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from rl2grid.arrays import F32
-from rl2grid.compile import jit
 from rl2grid.errors import one_of
 from rl2grid.grids import STEPS_PER_HOUR, Grid
-from rl2grid.mdp.state import GridState
 
 KINDS: tuple[str, ...] = ("T", "R")
 """Topology tasks and redispatching tasks."""
@@ -92,71 +91,12 @@ def physical_scale(grid: Grid, kind: str) -> tuple[F32, F32]:
     return shift, np.where(scale > 0, scale, np.float32(1.0))
 
 
-def observation_writer(kind: str) -> Callable[[GridState, int, F32], None]:
-    """The compiled ``(state, i, out)`` that writes a raw observation of row ``i`` to ``out``, float32 [feature].
+def check_kind(kind: str) -> None:
+    """Refuse what is no kind of task.
 
     Raises:
         UsageError: ``kind`` is neither ``"T"`` nor ``"R"``.
     """
-    _check(kind)
-    return write_topology_observation if kind == "T" else write_redispatch_observation
-
-
-@jit
-def write_topology_observation(state: GridState, i: int, out: F32) -> None:
-    """Write what a topology task observes in row ``i`` to ``out``, float32 [feature], in raw units."""
-    end = _write_shared(state, i, out)
-    end = _write(state.topo_vect[i], out, end)
-    end = _write(state.line_status[i], out, end)
-    end = _write(state.timestep_overflow[i], out, end)
-    end = _write(state.time_before_cooldown_sub[i], out, end)
-    _write_planned_and_stored(state, i, out, end)
-
-
-@jit
-def write_redispatch_observation(state: GridState, i: int, out: F32) -> None:
-    """Write what a redispatching task observes in row ``i`` to ``out``, float32 [feature], in raw units."""
-    end = _write_shared(state, i, out)
-    end = _write(state.target_dispatch[i], out, end)
-    end = _write(state.actual_dispatch[i], out, end)
-    end = _write(state.gen_margin_up[i], out, end)
-    end = _write(state.gen_margin_down[i], out, end)
-    end = _write(state.gen_p_before_curtail[i], out, end)
-    end = _write(state.curtailment[i], out, end)
-    end = _write(state.curtailment_limit[i], out, end)
-    _write_planned_and_stored(state, i, out, end)
-
-
-@jit
-def _write_shared(state: GridState, i: int, out: F32) -> int:
-    out[0] = np.float32(np.float64(state.step[i]) / np.float64(state.episode_length[i]))
-    end = _write(state.gen_p[i], out, 1)
-    end = _write(state.gen_theta[i], out, end)
-    end = _write(state.load_p[i], out, end)
-    end = _write(state.load_theta[i], out, end)
-    end = _write(state.rho[i], out, end)
-    return _write(state.time_before_cooldown_line[i], out, end)
-
-
-@jit
-def _write_planned_and_stored(state: GridState, i: int, out: F32, begin: int) -> None:
-    end = _write(state.time_next_maintenance[i], out, begin)
-    end = _write(state.duration_next_maintenance[i], out, end)
-    end = _write(state.storage_charge[i], out, end)
-    end = _write(state.storage_power_target[i], out, end)
-    end = _write(state.storage_power[i], out, end)
-    _write(state.storage_theta[i], out, end)
-
-
-@jit
-def _write(row: NDArray[Any], out: F32, begin: int) -> int:
-    size: int = row.shape[0]
-    for k in range(size):
-        out[begin + k] = np.float32(row[k])
-    return begin + size
-
-
-def _check(kind: str) -> None:
     if kind not in KINDS:
         raise one_of("Kind of task", kind, KINDS)
 
@@ -164,7 +104,7 @@ def _check(kind: str) -> None:
 @functools.cache
 def _layout(grid: Grid, kind: str) -> tuple[tuple[str, float, F32], ...]:
     """(name, shift, scale [entry]) of every feature, in order."""
-    _check(kind)
+    check_kind(kind)
     specific = _topology_features if kind == "T" else _redispatch_features
     rows = (*_shared_features(grid), *specific(grid), *_planned_and_stored_features(grid))
     return tuple((name, shift, np.atleast_1d(np.asarray(scale, np.float32))) for name, shift, scale in rows)

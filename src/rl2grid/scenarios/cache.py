@@ -26,7 +26,6 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-import filelock
 import numpy as np
 import platformdirs
 from numpy.typing import NDArray
@@ -73,6 +72,8 @@ def cached_series(grid_id: str, name: str, key: str, build: Callable[[], FolderC
         return series
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        import filelock  # here: importing rl2grid shall not take long
+
         with filelock.FileLock(stem.with_name(stem.name + ".lock")):
             series = _read(data, manifest) or _make(data, manifest, build())
     except OSError as error:
@@ -104,6 +105,8 @@ def _matches(data: Path) -> bool:
 
 def _remove(data: Path) -> bool:
     """Whether the copy was removed; one that was being made is sound by now."""
+    import filelock
+
     with filelock.FileLock(data.with_suffix(".lock")):
         if not data.is_file() or _matches(data):
             return False

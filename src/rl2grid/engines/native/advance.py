@@ -17,7 +17,6 @@ from rl2grid.engines.native.simulation import begin_simulation, copy_environment
 from rl2grid.engines.native.step import begin_step, dispatch_or_lose, finish_step, reset_row
 from rl2grid.mdp.accumulate import accrue, begin_episode, begin_transition, end_reset
 from rl2grid.mdp.actions import ActionKind
-from rl2grid.mdp.features import write_redispatch_observation, write_topology_observation
 from rl2grid.mdp.heuristics import (
     candidate_action,
     careful_candidate,
@@ -29,6 +28,7 @@ from rl2grid.mdp.heuristics import (
     remember_nothing,
     remember_topology,
 )
+from rl2grid.mdp.observations import write_redispatch_observation, write_topology_observation
 from rl2grid.mdp.rewards import default_components, paper_components, released_components
 from rl2grid.mdp.state import GridState
 
