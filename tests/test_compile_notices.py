@@ -47,7 +47,9 @@ def test_a_first_compilation_has_a_line_before_and_one_after(tmp_path: Path):
     assert told(tmp_path) == ""  # it was kept
 
 
-@pytest.mark.parametrize(("module", "environment"), [("mine", {}), ("rl2grid.mdp.state", {compile_notices.VARIABLE: "1"})])
+@pytest.mark.parametrize(
+    ("module", "environment"), [("mine", {}), ("rl2grid.mdp.state", {compile_notices.VARIABLE: "1"})]
+)
 def test_functions_of_a_user_and_quiet_commands_say_nothing(tmp_path: Path, module: str, environment: dict[str, str]):
     assert told(tmp_path, module, **environment) == ""
 

@@ -10,8 +10,8 @@ import pytest
 HEAVY = ("torch", "numba", "grid2op", "lightsim2grid", "matplotlib", "pandas", "scipy", "rich", "tyro")
 
 
-@pytest.mark.parametrize("words", [["--help"], ["--version"], ["analyse", "--help"], ["study"]])
-def test_help_is_shown_without_what_commands_need(words: list[str]):
+@pytest.mark.parametrize("words", [["--help"], ["--version"], ["analyse", "--help"], ["study"], ["tasks"]])
+def test_help_and_tasks_are_shown_without_what_other_commands_need(words: list[str]):
     code = (
         "import sys, contextlib, io\n"
         "from rl2grid.cli.main import main\n"
