@@ -67,6 +67,10 @@ def test_entries_are_ranked_by_survival(folder, capsys, monkeypatch):
     assert len(survivals) == 3
     assert survivals == sorted(survivals, reverse=True)
     assert survivals[0] == 0.999
+    assert main(["leaderboard", "table", *files, "--json"]) == 0
+    ((task, rows),) = json.loads(capsys.readouterr().out)["entries"].items()
+    assert task == "rl2grid/bus14-T0-v0"
+    assert [round(row["Survival"]["value"], 3) for row in rows] == survivals
 
 
 @pytest.mark.parametrize(

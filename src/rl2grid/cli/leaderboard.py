@@ -179,9 +179,10 @@ def _table(options: argparse.Namespace, output: Output) -> int:
     records: dict[str, list[dict[str, object]]] = {}
     for task, evaluations in by_task.items():
         table = entry_table({str(path): Method((result,)) for path, result in evaluations.items()})
-        output.table(table, title=task.removeprefix("rl2grid/"))
         records[task] = table_records(table)
-    output.results(**{table.name: records})
+        if not output.json:
+            output.table(table, title=task.removeprefix("rl2grid/"))
+    output.results(entries=records)
     output.remark("As stored: 'rl2grid leaderboard verify' plays the actions again.")
     return 0
 
