@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from sample_results import TASK, result
 
+from rl2grid.analysis.ledger_figure import draw_ledger
 from rl2grid.analysis.ledger_table import LEGEND, ledger_table
 from rl2grid.errors import UsageError
 from rl2grid.records.evaluations import identity_hash
@@ -90,14 +91,20 @@ def test_what_cannot_be_compared_is_marked():
     assert to_ppo.count("other budget") >= 1
 
 
-def test_tests_of_an_earlier_list_are_shown_without_comparison():
-    table = ledger_table(read_ledger(ROOT / "benchmarks" / "results" / "baselines.json"))
-    row = cells(table, "bus14-T0 sac recovery")
-    assert row["test survival"] == "**0.961** of 0.952, 0.954, 0.978"
-    assert (row["to do-nothing"], row["p"], row["marks"]) == ("", "", "b t v")
-
-
 def test_an_unknown_reference_is_refused():
     results = ledger(untrained("do-nothing", [0.1, 0.2]))
     with pytest.raises(UsageError, match="Reference 'greedy' does not exist: choose one of do-nothing"):
         ledger_table(results, TASK, "greedy")
+
+
+def test_the_figure_has_a_line_per_configuration_the_longest_lived_on_top():
+    results = ledger(
+        untrained("do-nothing", [0.1, 0.2]), trained(1, [0.6, 0.8]), trained(2, [0.6, 0.9]), untrained("greedy", [1, 1])
+    )
+    (axes,) = draw_ledger(results, TASK).axes
+    names = [label.get_text() for label in axes.get_yticklabels()]
+    assert names == ["do-nothing", "ppo + idle (1,000 decisions, 2 seeds)", "greedy"]
+    points = [line.get_xdata()[0] for line in axes.lines if line.get_marker() == "o"]
+    assert points == pytest.approx([0.15, 0.725, 1.0])
+    with pytest.raises(ValueError, match="no result of rl2grid/bus14-R-v0"):
+        draw_ledger(results, "rl2grid/bus14-R-v0")

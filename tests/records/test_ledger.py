@@ -36,7 +36,7 @@ def test_results_come_back_by_their_configuration(tmp_path: Path):
 def test_the_ledger_of_the_baselines_keeps_its_bytes(tmp_path: Path):
     """Read and written again it is the same file, and every result stands under the hash of its configuration."""
     results = read_ledger(LEDGER)
-    assert len(results) > 100
+    assert len(results) > 10
     path = tmp_path / "ledger.json"
     for digest, kept in results.items():
         assert digest == identity_hash(kept.configuration)

@@ -30,8 +30,7 @@ LEGEND = (
     "shares of months, with Wilson's intervals. Marks: a, entered after other configurations of the same agent and "
     "heuristic had had their test on these months (their number); b, another budget (decisions, validations, months of "
     "each) than most trained rows of the task with that heuristic; s, a run that had been evaluated on test months "
-    "before; t, trained under a heuristic with targets of an earlier version; v, of an earlier list, of whose months "
-    "nothing is kept."
+    "before; t, trained under a heuristic with targets of an earlier version."
 )
 _HEADINGS = (
     "task",
@@ -54,19 +53,16 @@ _HEADINGS = (
 
 
 @dataclass(frozen=True)
-class _Row:
+class LedgerRow:
     """One configuration with all its seeds."""
 
     results: tuple[HashedTest, ...]
     marks: str
+    """What the legend explains."""
 
     @property
     def first(self) -> HashedTest:
         return self.results[0]
-
-    @property
-    def has_values(self) -> bool:
-        return all(result.values for result in self.results)
 
     def scores(self, column: str, months: int | None = None, *, of_last: bool = False) -> Scores:
         """A column of the tests, seeds of the training as runs; the first ``months`` of them."""
@@ -99,7 +95,7 @@ def ledger_table(results: Mapping[str, HashedTest], task: str | None = None, ref
         raise one_of("Reference", reference, labels)
     reference = reference or REFERENCE
     heading = f"to {reference}"
-    rows = _rows(shown, results)
+    rows = ledger_rows(shown, results)
     compared = _compared(rows, reference)
     names = [name.format(heading=heading) for name in _HEADINGS]
     lines = [markdown_row(names), "|" + "---|" * len(names)]
@@ -107,14 +103,20 @@ def ledger_table(results: Mapping[str, HashedTest], task: str | None = None, ref
     return "\n".join([*lines, "", LEGEND.format(heading=heading.capitalize())])
 
 
-def _rows(shown: Mapping[str, HashedTest], results: Mapping[str, HashedTest]) -> list[_Row]:
+def ledger_rows(shown: Mapping[str, HashedTest], results: Mapping[str, HashedTest]) -> list[LedgerRow]:
+    """Rows in the order of the table.
+
+    Args:
+        shown: results that are shown.
+        results: all of the ledger, whose order says what was seen before.
+    """
     groups = [list(group) for _, group in itertools.groupby(sorted(shown.values(), key=_place), key=_choice)]
     budgets: dict[tuple[str, Any], Counter[tuple[Any, ...]]] = {}
     for first, *_ in groups:
         if first.training:
             budgets.setdefault((first.task, first.heuristic), Counter())[budget(first)] += 1
     usual = {key: max(counts, key=lambda one: (counts[one], dict(one)["decisions"])) for key, counts in budgets.items()}
-    return [_Row(tuple(group), _marks(group, usual, results)) for group in groups]
+    return [LedgerRow(tuple(group), _marks(group, usual, results)) for group in groups]
 
 
 def _marks(
@@ -128,26 +130,25 @@ def _marks(
         marks += ["s"] if any(one.training.get("tested_before") for one in group) else []
         is_old = first.configuration.get("targets_version", 1) < TARGETS_VERSION
         marks += ["t"] if is_old and first.heuristic else []  # without a heuristic, the targets were the same
-    marks += [] if all(one.values for one in group) else ["v"]
     return " ".join(marks)
 
 
-def _compared(rows: Sequence[_Row], reference: str) -> dict[int, Difference | str]:
+def _compared(rows: Sequence[LedgerRow], reference: str) -> dict[int, Difference | str]:
     """Difference of each row to the reference of its task, or why there is none."""
     found: dict[int, Difference | str] = {}
     for _, group in itertools.groupby(enumerate(rows), key=lambda one: one[1].first.task):
         numbered = dict(group)
-        base = next((row for row in numbered.values() if row.first.label == reference and row.has_values), None)
+        base = next((row for row in numbered.values() if row.first.label == reference), None)
         if base is None:
             continue
-        others = {number: row for number, row in numbered.items() if row is not base and row.has_values}
+        others = {number: row for number, row in numbered.items() if row is not base}
         allowed = {number: row for number, row in others.items() if _is_fair(row, base)}
         found |= dict.fromkeys(others.keys() - allowed.keys(), "other budget")
         found |= _differences(allowed, base)
     return found
 
 
-def _differences(rows: Mapping[int, _Row], base: _Row) -> dict[int, Difference]:
+def _differences(rows: Mapping[int, LedgerRow], base: LedgerRow) -> dict[int, Difference]:
     """To one row, each on all months that both played; corrected as one family."""
     found: dict[int, Difference] = {}
     for number, row in rows.items():
@@ -157,7 +158,7 @@ def _differences(rows: Mapping[int, _Row], base: _Row) -> dict[int, Difference]:
     return {number: replace(one, holm=float(p)) for (number, one), p in zip(found.items(), corrected, strict=True)}
 
 
-def _is_fair(row: _Row, base: _Row) -> bool:
+def _is_fair(row: LedgerRow, base: LedgerRow) -> bool:
     """Whether a difference is of the agents: on the same list, and trained ones with the same budget."""
     same_list = common_months(row.first.months, base.first.months) > 0
     return same_list and (not (row.first.training and base.first.training) or budget(row.first) == budget(base.first))
@@ -173,7 +174,7 @@ def _place(result: HashedTest) -> tuple[Any, ...]:
     return result.task, bool(result.training), result.agent, str(result.heuristic), result.choice, seed
 
 
-def _cells(row: _Row, compared: Difference | str | None) -> list[str]:
+def _cells(row: LedgerRow, compared: Difference | str | None) -> list[str]:
     first, training = row.first, [result.training for result in row.results]
     cells = [short_id(first.task), first.agent, first.heuristic or "none", _months(first)]
     if first.training:
@@ -195,23 +196,16 @@ def _months(result: HashedTest) -> str:
     return str(result.months["number"]) + (f" (list {version})" if version else "")
 
 
-def _survival(row: _Row) -> list[str]:
+def _survival(row: LedgerRow) -> list[str]:
     """Of the best policies, and of the last."""
     each = [result.test["survival"][0] for result in row.results]
-    if not row.has_values:
-        _, low, high = row.first.test["survival"]
-        mean = f"**{np.mean(each):.3f}** of {_seeds(each, '.3f')}"
-        return [f"{each[0]:.3f} [{low:.3f}, {high:.3f}]" if len(each) == 1 else mean, ""]
     best = with_interval(estimate(row.scores("survival")), 3)
     last = estimate(row.scores("survival", of_last=True)).value if any(one.last for one in row.results) else None
     return [best if len(each) == 1 else f"**{best}** of {_seeds(each, '.3f')}", "" if last is None else f"{last:.3f}"]
 
 
-def _shares(row: _Row) -> list[str]:
+def _shares(row: LedgerRow) -> list[str]:
     """Completed, cost and safe months."""
-    if not row.has_values:
-        forms = {"completed": ".0%", "cost_tlo": ".0f", "safe_tlo": ".0%", "safe_lsi": ".0%"}
-        return [_seeds([result.test[name][0] for result in row.results], form) for name, form in forms.items()]
     cost = estimate(row.scores("cost_tlo")).value
     completed, tlo, lsi = (estimate(one) for one in (row.scores("completed"), row.safe("TLO"), row.safe("LSI")))
     return [share_text(completed), f"{cost:.0f}", share_text(tlo), share_text(lsi)]

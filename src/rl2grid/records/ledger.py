@@ -51,12 +51,12 @@ class HashedTest:
     """Number of episodes, and value, low and high end of each figure, rounded."""
     months: Mapping[str, Any]
     """Which months: split, its version, that of the generator, number of months and of seeds."""
-    values: Mapping[str, str] = field(default_factory=dict)
-    """What every month came to, see :mod:`rl2grid.records.month_values`; empty for results on the first test list."""
-    last: Mapping[str, str] = field(default_factory=dict)
+    values: Mapping[str, str]
+    """What every month came to, see :mod:`rl2grid.records.month_values`."""
+    last: Mapping[str, str]
     """The same of the run's last policy; empty where that is the best one, or nothing was trained."""
     checksum: str = field(default="", compare=False)
-    """Of all else; empty for results that were entered before there was one."""
+    """Of all else; empty where it was left out because a change is meant."""
 
     @property
     def task(self) -> str:

@@ -1,0 +1,66 @@
+"""The ledger of test results as a figure: a task's configurations by what they survive."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import matplotlib
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import PercentFormatter
+
+from rl2grid.analysis.ledger_table import LedgerRow, ledger_rows
+from rl2grid.drawing.theme import LIGHT, Theme, style
+from rl2grid.envs.tasks import short_id
+from rl2grid.records.ledger import HashedTest
+from rl2grid.records.statistics import estimate
+
+
+def draw_ledger(results: Mapping[str, HashedTest], task: str, *, theme: Theme = LIGHT) -> Figure:
+    """Survival on the test months with 95% intervals, a line per configuration, the longest-lived on top.
+
+    Args:
+        results: of a ledger.
+        task: id of the task.
+        theme: of the figure.
+
+    Raises:
+        ValueError: the ledger has no result of the task.
+    """
+    rows = ledger_rows({digest: one for digest, one in results.items() if one.task == task}, results)
+    if not rows:
+        raise ValueError(f"The ledger has no result of {task}.")
+    found = sorted(((estimate(row.scores("survival")), row) for row in rows), key=lambda one: one[0].value)
+    with matplotlib.rc_context(style(theme)):
+        figure = Figure(figsize=(8.4, 1.5 + 0.3 * len(rows)), layout="constrained")
+        axes = figure.subplots()
+        for place, (survival, row) in enumerate(found):
+            colour = theme.series[int(bool(row.first.training))]
+            axes.plot([survival.low, survival.high], [place, place], color=colour, linewidth=2, alpha=0.55)
+            axes.plot(survival.value, place, marker="o", color=colour, markersize=6)
+            if row.first.training and len(row.results) > 1:
+                each = [one.test["survival"][0] for one in row.results]
+                axes.plot(each, [place] * len(each), linestyle="", marker="|", color=colour, markersize=9)
+        axes.set_yticks(range(len(found)), [_name(row) for _, row in found])
+        axes.set(xlim=(0, 1.01), ylim=(-0.6, len(found) - 0.4), xlabel="Share of the month survived")
+        axes.xaxis.set_major_formatter(PercentFormatter(1.0))
+        axes.grid(axis="x")
+        axes.set_title(f"{short_id(task)}, test months", loc="left")
+        if any(row.first.training for row in rows):
+            axes.legend(handles=_legend(theme), loc="lower right", frameon=False)
+    return figure
+
+
+def _name(row: LedgerRow) -> str:
+    if not row.first.training:
+        return row.first.label
+    seeds = f", {len(row.results)} seeds" if len(row.results) > 1 else ""
+    return f"{row.first.label} ({row.first.training['decisions']:,} decisions{seeds})"
+
+
+def _legend(theme: Theme) -> list[Line2D]:
+    untrained, trained, *_ = theme.series
+    return [
+        Line2D([], [], color=untrained, marker="o", label="without training"),
+        Line2D([], [], color=trained, marker="o", label="trained (ticks: each seed)"),
+    ]
