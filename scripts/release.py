@@ -28,7 +28,7 @@ TRIALS = (
     "rl2grid --version",
     "rl2grid tasks",
     "rl2grid evaluate do-nothing bus14-T0 --months 2",
-    "rl2grid train ppo bus14-T0 --heuristic idle --decisions 2048 --validation-months 1 --folder run",
+    "rl2grid train ppo bus14-T0 --heuristic idle --decisions 2048 --validation-months 1 --output run",
     "rl2grid evaluate run bus14-T0 --months 1",
 )
 
