@@ -1,6 +1,5 @@
 """An episode is a function of its seed and number."""
 
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -175,13 +174,3 @@ def test_only_drawn_starts_of_generated_months_are_drawn_again(monkeypatch) -> N
     assert plan_episode(BUS14, "train", 0, 0, start=plan.start).redraws == 0
     assert plan_episode(BUS14, "bundled", 0, 0).redraws == 0
     assert episodes._draw_start(BUS14, load_scenario("bus14", "bundled/0000"), 0, 0).redraws == 0
-
-
-@pytest.mark.parametrize("grid_id", ["bus14", pytest.param("bus118-MOB-v1", marks=pytest.mark.slow)])
-def test_planning_takes_less_than_a_millisecond(grid_id: str) -> None:
-    grid = load_grid(grid_id)
-    plan = plan_episode(grid, "train", 0, 0)
-    began = time.perf_counter()
-    for _ in range(50):
-        assert plan_episode(grid, "train", 0, 0) == plan
-    assert (time.perf_counter() - began) / 50 < 0.001
