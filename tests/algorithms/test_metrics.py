@@ -21,7 +21,7 @@ def write(folder: Path, steps: list[int], *, after_step: int = -1, tensorboard: 
 def test_rows_make_one_column_per_metric_in_pandas(tmp_path: Path):
     write(tmp_path, [1, 2, 3])
     table = pd.read_csv(tmp_path / "metrics.csv")
-    assert list(table.columns) == ["step", "grid_steps", "wall_time", "name", "value"]
+    assert list(table.columns) == ["step", "grid_steps", "wall_time", "name", "value", "checksum"]
     wide = table.pivot(index="step", columns="name", values="value")
     assert wide["charts/survival"].tolist() == pytest.approx([1 / 7, 2 / 7, 3 / 7], rel=1e-15)
     assert table["grid_steps"].tolist() == [10, 10, 20, 20, 30, 30]

@@ -58,7 +58,7 @@ SEARCH: dict[str, Any] = {"name": "search", "algorithm": "ppo", "task": "bus14-T
             {"algorithm": "lagrangian-ppo", "task": "bus14-T0-TLO", "space": {"thresholds": [[0.0], [50.0]]}},
             "The thresholds cannot be searched",
         ),
-        ({"budget": 10}, "total_timesteps of at least"),
+        ({"budget": 10}, "total_timesteps (--decisions) of at least"),
         ({"seeds": []}, "a list of different whole numbers"),
         ({"seeds": [1, 1]}, "a list of different whole numbers"),
         ({"space": {"cost_weight": ["x"]}}, "Each choice for cost_weight must be a number"),

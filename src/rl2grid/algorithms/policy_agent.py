@@ -29,6 +29,9 @@ CHECKPOINT_FILE = "checkpoint.pt"
 """In a run folder: everything needed to go on."""
 MAX_WEIGHT = 1e8
 """A larger one is no weight that was learned."""
+SMALL_NETWORK = 2**24
+"""Weights of a network that is made to see whether those of the file fit. Networks of one's own may have fewer weights
+than widths of layers suggest; a larger one is not made for a file that does not hold as many."""
 
 
 class PolicyAgent:
@@ -177,7 +180,7 @@ def _check_policy(path: Path, policy: Mapping[str, Any]) -> None:
     widths = [value for name, value in policy.items() if name.endswith("layers")]
     needed = max((a * b for layers in widths for a, b in itertools.pairwise(layers)), default=0)
     widest = max((width for layers in widths for width in layers), default=0)
-    if max(needed, widest, int(policy.get("n_costs", 0))) > there:
+    if max(needed, widest, int(policy.get("n_costs", 0))) > max(there, SMALL_NETWORK):
         raise UsageError(f"Checkpoint {str(path)!r} cannot be played: its networks have other sizes than its weights.")
 
 

@@ -29,7 +29,7 @@ from rl2grid.mdp.rewards import resolve_reward, reward_name
 from rl2grid.records.episodes import Episode
 from rl2grid.records.evaluation_folder import open_store
 from rl2grid.records.evaluations import Evaluation, labels
-from rl2grid.records.files import printable
+from rl2grid.records.files import check_folder, printable
 from rl2grid.records.versions import library_versions
 from rl2grid.scenarios.library import (
     check_in_split,
@@ -94,6 +94,8 @@ def evaluate(
     resolve_reward(keywords.get("reward", "default"))
     chosen_scenarios = _checked_scenarios(task, split, scenarios)
     jobs = _jobs(chosen_scenarios, seeds, start)
+    if output is not None:
+        check_folder(output)  # before months are made, which takes minutes
     watch_making(task.grid_id, *make_scenarios(task.grid_id, chosen_scenarios), progress)
     return run_evaluation(
         # The agent whose identity is stored, not its path: a run that still trains replaces the file.
