@@ -20,7 +20,7 @@ def entry(seed: int, learning_rate: float = 0.1, version: str = "2", **configura
     chosen |= {"env_keywords": {"heuristic": "idle"}, "test": {"split_version": version, "months": 500}}
     training = {"identity": {"budget": {"decisions": 1000, "evaluate_every": 250, "validation_months": 20}}}
     months = {"split": "test", "split_version": version, "generator_version": "1", "number": 500, "seeds": 1}
-    return HashedTest({**chosen, **configuration}, training, "", "", {}, months)
+    return HashedTest({**chosen, **configuration}, training, "", "", {}, months, {}, {})
 
 
 def ledger(*results: HashedTest) -> dict[str, HashedTest]:
@@ -48,4 +48,4 @@ def test_what_came_after_another_choice_of_its_method_is_known():
 
 def test_a_budget_is_decisions_and_validations():
     assert budget(entry(1)) == (("decisions", 1000), ("evaluate_every", 250), ("validation_months", 20))
-    assert budget(HashedTest({"agent": "greedy", "task": TASK, "heuristic": None}, {}, "", "", {}, {})) == ()
+    assert budget(HashedTest({"agent": "greedy", "task": TASK, "heuristic": None}, {}, "", "", {}, {}, {}, {})) == ()
