@@ -17,7 +17,7 @@ import pytest
 import rl2grid  # noqa: F401  (registers the tasks)
 from rl2grid.errors import UsageError
 from rl2grid.grids import load_grid
-from rl2grid.scenarios import generated, library
+from rl2grid.scenarios import generated, library, packs
 from rl2grid.scenarios.cache import data_folder
 from rl2grid.scenarios.episodes import MAX_STEPS, EpisodePlan, maintenance_matrix, plan_episode
 from rl2grid.scenarios.generator import month as generator
@@ -94,7 +94,6 @@ def test_the_pack_of_another_month_in_its_place_is_made_again(made) -> None:
     hashes = {name: generated.series_hash(BUS14, name) for name in ("17-03", "17-04")}
     packs = [generated.pack_path(BUS14, 17, month) for month in (3, 4)]
     shutil.copyfile(packs[1], packs[0])
-    shutil.copyfile(packs[1].with_suffix(".head"), packs[0].with_suffix(".head"))
     made.clear()
     assert generated.series_hash(BUS14, "17-03") == hashes["17-03"]
     assert made == [(17, 3)]
@@ -110,16 +109,21 @@ def test_an_edited_hash_in_the_head_of_a_pack_is_noticed(made) -> None:
     assert made == [(17, 3), (17, 3)]
 
 
-def test_a_pack_that_expands_to_more_than_a_month_is_not_expanded(made, monkeypatch) -> None:
+def test_a_pack_that_expands_to_more_than_a_month_is_not_expanded(made) -> None:
     generated.series_hash(BUS14, "17-03")
     path = generated.pack_path(BUS14, 17, 3)
-    assert generated._is_bounded(path)
-    monkeypatch.setattr(generated, "_MONTH_BYTES", 2**20)
-    head, _, _ = path.read_bytes().partition(b"\n")
+    month = packs.read_raw(path)
+    size = 2 * sum(array.size for array in (month.load_p, month.load_q, month.prod_p))
+    head, _, within = path.read_bytes().partition(b"\n")
+    assert packs._expanded(within, size) is not None
     body = zlib.compress(bytes(2**22))
     header = json.loads(head) | {"sha256": hashlib.sha256(body).hexdigest()}
-    path.write_bytes(json.dumps(header).encode() + b"\n" + body)
-    assert not generated._is_bounded(path)
+    del header["checksum"]
+    path.write_bytes(json.dumps(header | {"checksum": packs._checksum(header)}).encode() + b"\n" + body)
+    assert packs.read_head(path)["series"] == generated.series_hash(BUS14, "17-03")
+    assert packs._expanded(body, size) is None
+    with pytest.raises(UsageError, match="does not hold a month of bus14"):
+        packs.read_raw(path)
     assert generated._read(BUS14, 17, 3) is None
 
 

@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as numpy_strategies
 from numpy.typing import NDArray
 
 from rl2grid.grids import MaintenanceConfig
-from rl2grid.scenarios.maintenance import clipped_outages, maintenance_times, matrix_of, outages_of, sample_maintenance
+from rl2grid.scenarios.maintenance import clipped_outages, maintenance_times, matrix_of, outages_of, sample_outages
 from rl2grid.streams import Purpose, Stream
 
 NAMES = tuple(f"line_{i}" for i in range(8))
@@ -80,7 +80,8 @@ class ReplayedDraws:
 def test_a_sample_equals_grid2ops_with_the_same_draws(start: datetime, n_rows: int) -> None:
     total = 0
     for seed in range(5):
-        ours = sample_maintenance(CONFIG, start, n_rows, len(NAMES), Stream(seed, 3, Purpose.MAINTENANCE))
+        outages = sample_outages(CONFIG, start, n_rows, Stream(seed, 3, Purpose.MAINTENANCE))
+        ours = matrix_of(outages, n_rows, len(NAMES))
         last = start + (n_rows - 1) * timedelta(minutes=5)
         n_dates = (last.date() - start.date()).days
         draws = Stream(seed, 3, Purpose.MAINTENANCE).uniform(n_dates * 10).reshape(n_dates, 2, 5)
@@ -103,11 +104,11 @@ def test_a_sample_equals_grid2ops_with_the_same_draws(start: datetime, n_rows: i
 
 
 def test_frequency_maximum_and_hours() -> None:
-    config = MaintenanceConfig((0, 3), (0.25,) * 12, (1,) * 12, 9, 17)
+    config, n_rows = MaintenanceConfig((0, 3), (0.25,) * 12, (1,) * 12, 9, 17), 288 * 28 + 1
     samples = np.stack(
         [
-            sample_maintenance(config, datetime(2019, 1, 6), 288 * 28 + 1, 4, Stream(seed, 0, Purpose.MAINTENANCE))
-            for seed in range(200)
+            matrix_of(sample_outages(config, datetime(2019, 1, 6), n_rows, stream), n_rows, 4)
+            for stream in (Stream(seed, 0, Purpose.MAINTENANCE) for seed in range(200))
         ]
     )
     assert not samples[:, :, [1, 2]].any()

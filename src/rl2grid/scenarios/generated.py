@@ -9,14 +9,11 @@ read; a damaged one is made again; of what training has drawn only the latest is
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import hashlib
 import itertools
 import json
-import os
 import re
-import zlib
 from collections.abc import Sequence
 from dataclasses import fields
 from importlib import resources
@@ -61,10 +58,6 @@ _POWER_FLOW = ("ac", "bits", "factors", "flow_state", "model", "newton", "orderi
 
 _NAME = re.compile(r"(?P<seed>0|[1-9]\d{0,18})-(?P<month>\d\d)(\+(?P<next>\d\d))?")
 _LOCKS = 64
-_PACK_BYTES, _MONTH_BYTES, _HEAD_BYTES = 2**26, 2**28, 2**12
-"""More than any pack takes, expands to, and has as its head."""
-_VERIFIED = ".head"
-"""Suffix of the file beside a pack whose head was verified."""
 _EXPANDED_MONTHS = itertools.count()
 """How many this process has expanded so far."""
 
@@ -188,39 +181,22 @@ def series_hash(grid: Grid, name: str) -> str:
         UsageError: there are no such months, or the data folder cannot be written.
     """
     months = parse_months(name)
-    paths = [pack_path(grid, months.seed, month) for month in months.numbers]
-    if not all(path.is_file() for path in paths):
-        make_months(grid, months.seed, months.numbers)
-    hashes = [_verified_hash(grid, months.seed, month) for month in months.numbers]
+    hashes = [_stored_hash(grid, months.seed, month) for month in months.numbers]
     if None in hashes:
         make_months(grid, months.seed, months.numbers)
-        hashes = [_verified_hash(grid, months.seed, month) for month in months.numbers]
+        hashes = [_stored_hash(grid, months.seed, month) for month in months.numbers]
     return "+".join(str(each) for each in hashes)
 
 
-def _verified_hash(grid: Grid, seed: int, month: int) -> str | None:
-    """The hash in the head of a pack; None where there is no sound pack of that month.
+def _stored_hash(grid: Grid, seed: int, month: int) -> str | None:
+    """The hash in the head of a pack; None where there is no sound pack of that month."""
+    from rl2grid.scenarios import packs
 
-    A head that was verified against the values below it is remembered by its own hash in a file beside the pack.
-    """
-    from rl2grid.scenarios.packs import read_series_hash
-
-    path = pack_path(grid, seed, month)
     try:
-        with path.open("rb") as stream:
-            head = hashlib.sha256(path.name.encode() + stream.readline(_HEAD_BYTES)).hexdigest()
-        known = path.with_suffix(_VERIFIED)
-        if known.is_file() and known.read_bytes() == head.encode():
-            return read_series_hash(path)
-    except OSError:
+        head = packs.read_head(pack_path(grid, seed, month))
+    except UsageError:
         return None
-    if _read(grid, seed, month) is None:
-        return None
-    with contextlib.suppress(OSError):  # a folder that is only read is verified every time
-        temporary = known.with_name(f".{known.name}.{os.getpid()}")
-        temporary.write_bytes(head.encode())
-        os.replace(temporary, known)
-    return read_series_hash(path)
+    return str(head["series"]) if (head["grid"], head["seed"], head["month"]) == (grid.id, seed, month) else None
 
 
 def _content(grid: Grid, months: Months) -> FolderContent:
@@ -290,24 +266,11 @@ def _read(grid: Grid, seed: int, month: int) -> RawMonth | None:
     """The month in its pack; None where there is no sound one, or that of another month in its place."""
     from rl2grid.scenarios import packs
 
-    path = pack_path(grid, seed, month)
     try:
-        if not _is_bounded(path):
-            return None
-        raw = packs.read_raw(path)
-        sound = (raw.grid_id, raw.seed, raw.month) == (grid.id, seed, month)
-        return raw if sound and packs.read_series_hash(path) == packs.hash_of_month(raw) else None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, zlib.error):
-        return None  # whatever else the head of a pack may hold
-
-
-def _is_bounded(path: Path) -> bool:
-    """Whether a pack is no larger than packs are, and does not expand to more than a month is."""
-    if path.stat().st_size > _PACK_BYTES:
-        return False
-    unpacking = zlib.decompressobj()
-    length = len(unpacking.decompress(path.read_bytes().partition(b"\n")[2], _MONTH_BYTES))
-    return unpacking.eof and length < _MONTH_BYTES
+        raw = packs.read_raw(pack_path(grid, seed, month))
+    except UsageError:
+        return None
+    return raw if (raw.grid_id, raw.seed, raw.month) == (grid.id, seed, month) else None
 
 
 def _read_back(grid: Grid, seed: int, month: int) -> RawMonth:
@@ -345,7 +308,7 @@ def _remove_oldest(paths: list[Path], limit: int) -> None:
         if excess <= 0:
             return
         # What other processes have mapped stays readable for them.
-        for companion in (path, *(path.with_suffix(suffix) for suffix in (".json", ".lock", _VERIFIED))):
+        for companion in (path, *(path.with_suffix(suffix) for suffix in (".json", ".lock"))):
             companion.unlink(missing_ok=True)
         excess -= size
 

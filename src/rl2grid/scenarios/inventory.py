@@ -99,7 +99,7 @@ def _remove(path: Path) -> Removed:
 def _lock_of(path: Path) -> Path:
     """The lock that whoever makes a file of the caches holds."""
     name = path.name.removeprefix(".")
-    if ".pack" in name or name.endswith(".head"):
+    if ".pack" in name:
         seed = name.partition("-")[0]
         return pack_lock(path.parent, int(seed)) if seed.isdigit() else path.with_suffix(".lock")
     stem = name.partition(".npy")[0].partition(".json")[0]

@@ -44,13 +44,6 @@ def sample_outages(
     return clipped_outages(np.stack([lines[which], begin, end], axis=1), 0, n_rows)
 
 
-def sample_maintenance(
-    config: MaintenanceConfig, start_datetime: datetime, n_rows: int, n_line: int, stream: Stream
-) -> NDArray[np.bool_]:
-    """:func:`sample_outages` as bool [rows, line], True where a line is out."""
-    return matrix_of(sample_outages(config, start_datetime, n_rows, stream), n_rows, n_line)
-
-
 def outages_of(matrix: NDArray[np.bool_]) -> NDArray[np.int32]:
     """Outages of a matrix [row, line], int32 [outage, 3]: line, first row, row after the last; by line and row."""
     lines = np.flatnonzero(matrix.any(axis=0))
