@@ -1,0 +1,256 @@
+"""Random steps without end: environments as users make them, and what must hold of every step.
+
+``python benchmarks/fuzz.py [--steps 1000000] [--grids ...] [--kinds T R]`` plays so many grid steps per grid and kind
+of action, a quarter with each heuristic, and writes ``benchmarks/results/fuzz.json``. Half of the environments play
+legal actions, the others whatever the space has; now and then an environment is saved, played on and brought back, and
+must play the same again. Whatever breaks a rule of :func:`broken_rules`, raises an exception or is another step after
+coming back counts as a failure. A cell that is in the results of the same command is not played again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shlex
+import sys
+import time
+import traceback
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+import rl2grid  # noqa: F401 - registers the tasks
+from rl2grid.grids import GRID_IDS, load_grid
+from rl2grid.records.files import write_json
+
+RESULTS = Path(__file__).resolve().parent / "results" / "fuzz.json"
+NUM_ENVS = 32
+KINDS = ("T", "R")
+SETTINGS: tuple[dict[str, Any], ...] = (
+    {"heuristic": None, "split": "train", "gamma": 0.99},
+    {"heuristic": "idle", "split": "bundled", "normalize": None, "reward": "paper"},
+    {"heuristic": "recovery", "split": "train", "constraint": "TLO", "gamma": 0.9},
+    {"heuristic": "careful", "split": "train", "constraint": "LSI", "reward": "released"},
+)
+DISPATCH = ("exact", "grid2op")
+EVERY = 50
+"""Steps after which one environment is saved, and after which it is brought back."""
+TOLERANCE = 1e-9
+"""Relative, of sums of rewards that are added up in another order."""
+EXAMPLES = 10
+"""Failures of a cell that are put into words."""
+
+
+@dataclass
+class Found:
+    """What a cell came to."""
+
+    grid_steps: int = 0
+    decisions: int = 0
+    episodes: int = 0
+    completed: int = 0
+    illegal: int = 0
+    brought_back: int = 0
+    game_overs: Counter[str] = field(default_factory=Counter)
+    failures: int = 0
+    examples: list[str] = field(default_factory=list)
+    seconds: float = 0.0
+
+    def fail(self, words: str) -> None:
+        """Count a failure."""
+        self.failures += 1
+        if len(self.examples) < EXAMPLES:
+            self.examples.append(words)
+
+
+@dataclass
+class Sums:
+    """What the transitions of the episodes under way add up to."""
+
+    steps: NDArray[np.int64]
+    rewards: NDArray[np.float64]
+
+    def begin(self, infos: dict[str, Any], where: NDArray[np.bool_]) -> None:
+        """Begin an episode with what its reset played."""
+        self.steps[where] = infos["reset_steps"][where]
+        self.rewards[where] = infos["reset_reward"][where]
+
+
+def task_id(grid: str, kind: str) -> str:
+    """The task of a kind with the most actions."""
+    level = len(load_grid(grid).level_sizes) - 1
+    return f"rl2grid/{grid}-{'R' if kind == 'R' else f'T{level}'}-v0"
+
+
+def actions_of(envs: Any, draws: np.random.Generator) -> NDArray[Any]:
+    """Legal actions for the first half of the environments, any for the others."""
+    if isinstance(envs.single_action_space, gymnasium.spaces.Discrete):
+        n_actions = int(envs.single_action_space.n)
+        actions = draws.integers(n_actions, size=envs.num_envs)
+        masks = envs.action_masks()
+        for i in range(envs.num_envs // 2):
+            actions[i] = draws.choice(np.flatnonzero(masks[i]))
+        actions[draws.random(envs.num_envs) < draws.choice([0.0, 0.5, 0.95])] = 0
+        return actions
+    shape = envs.action_space.shape
+    actions = draws.uniform(-1.0, 1.0, shape) * draws.choice([0.02, 0.2, 1.0], size=(shape[0], 1))
+    corners = draws.random(shape[0]) < 0.2
+    actions[corners] = draws.choice([-1.0, 0.0, 1.0], size=(int(corners.sum()), shape[1]))
+    actions[draws.random(shape[0]) < 0.3] = 0.0
+    return actions.astype(np.float32)
+
+
+def broken_rules(
+    envs: Any, outcome: tuple[Any, ...], sums: Sums, legal: NDArray[np.bool_], reward: str
+) -> Iterator[str]:
+    """What a step breaks of what is promised; ``legal`` marks environments whose action was legal."""
+    observations, rewards, terminated, truncated, infos = outcome
+    over = terminated | truncated
+    last = ended_infos(infos, over)
+    played = last["n_steps"]
+    yield from (name for name, bad in {
+        "an observation is not finite": ~np.isfinite(observations).all(axis=1),
+        "a reward is not finite": ~np.isfinite(rewards),
+        "a reward is negative": (rewards < 0) & (reward == "default"),
+        "both terminated and truncated": terminated & truncated,
+        "terminated without a game over": terminated & (last["game_over"] == 0),
+        "alive with a game over": ~over & (last["game_over"] != 0),
+        "completed, but survival is not 1": truncated & (last["survival"] != 1.0),
+        "survival outside of 0 to 1": (last["survival"] < 0) | (last["survival"] > 1),
+        "more steps than the episode has": last["step"] > last["episode_length"],
+        "a transition without a step": (played < 1) & ~(over & (last["reset_steps"] == last["step"])),
+        "steps that no transition has": last["step"] != sums.steps + played,
+        "rewards that no transition has": ~np.isclose(
+            last["episode_return"], sums.rewards + rewards, rtol=TOLERANCE, atol=1e-6
+        ),
+        "a legal action was called illegal": legal & last["illegal"].astype(bool),
+        "negative costs": np.stack(list(last["costs"].values())).min(axis=0) < 0,
+    }.items() if bad.any())  # fmt: skip
+
+
+def ended_infos(infos: dict[str, Any], over: NDArray[np.bool_]) -> dict[str, Any]:
+    """Infos of the transitions: of environments whose episode ended, those of its end."""
+    if not over.any():
+        return infos
+    final = infos["final_info"]
+    names = ("n_steps", "step", "episode_length", "survival", "game_over", "illegal", "reset_steps", "episode_return")
+    merged = {name: np.where(over, final[name], infos[name]) for name in names}
+    costs = {name: np.where(over, final["costs"][name], values) for name, values in infos["costs"].items()
+             if not name.startswith("_")}  # fmt: skip
+    return merged | {"costs": costs, "game_over_text": np.where(over, final["game_over_text"], "")}
+
+
+def play(grid: str, kind: str, setting: dict[str, Any], steps: int, seed: int, bar: Any) -> Found:
+    """Play a cell."""
+    found, began = Found(), time.monotonic()
+    draws = np.random.default_rng([seed, GRID_IDS.index(grid), KINDS.index(kind)])
+    number = SETTINGS.index(setting)
+    keywords = setting | ({"dispatch": DISPATCH[number % 2]} if kind == "R" else {})
+    envs: Any = gymnasium.make_vec(task_id(grid, kind), num_envs=NUM_ENVS, num_threads=1, **keywords)
+    try:
+        _play(envs, setting, steps, draws, seed, found, bar)
+    except Exception as error:  # whatever is raised is what is looked for
+        frame = traceback.extract_tb(error.__traceback__)[-1]
+        found.fail(f"{type(error).__name__}: {error} ({Path(frame.filename).name}:{frame.lineno})")
+    envs.close()
+    found.seconds = round(time.monotonic() - began, 1)
+    return found
+
+
+def _play(
+    envs: Any, setting: dict[str, Any], steps: int, draws: np.random.Generator, seed: int, found: Found, bar: Any
+) -> None:
+    _, infos = envs.reset(seed=seed)
+    sums = Sums(np.zeros(NUM_ENVS, np.int64), np.zeros(NUM_ENVS))
+    sums.begin(infos, np.ones(NUM_ENVS, np.bool_))
+    reward, discrete = setting.get("reward", "default"), hasattr(envs.single_action_space, "n")
+    while found.grid_steps < steps:
+        actions = actions_of(envs, draws)
+        legal = envs.action_masks()[np.arange(NUM_ENVS), actions] if discrete else np.zeros(NUM_ENVS, np.bool_)
+        if found.decisions // NUM_ENVS % EVERY == 0:
+            _bring_back(envs, actions, found)
+        outcome = envs.step(actions)
+        for words in broken_rules(envs, outcome, sums, legal, reward):
+            found.fail(f"{words} (decision {found.decisions // NUM_ENVS})")
+        _, rewards, terminated, truncated, infos = outcome
+        over = terminated | truncated
+        last = ended_infos(infos, over)
+        sums.steps += last["n_steps"]
+        sums.rewards += rewards
+        sums.begin(infos, over)
+        played = int(last["n_steps"].sum())
+        found.grid_steps += played
+        found.decisions += NUM_ENVS
+        found.episodes += int(over.sum())
+        found.completed += int(truncated.sum())
+        found.illegal += int(last["illegal"].sum())
+        found.game_overs.update(
+            text.partition(":")[0] for text in np.asarray(last.get("game_over_text", ()))[terminated]
+        )
+        bar(played)
+
+
+def _bring_back(envs: Any, actions: NDArray[Any], found: Found) -> None:
+    """Save all environments, step, and bring them back twice: the first time, the same step must follow."""
+    worlds = [envs.save(j) for j in range(envs.num_envs)]
+    observations, rewards, terminated, truncated, _ = envs.step(actions)
+    first = observations.copy(), rewards.copy(), terminated.copy(), truncated.copy()
+    for j, world in enumerate(worlds):
+        envs.restore(j, world)
+    again = envs.step(actions)
+    names = ("observations", "rewards", "terminated", "truncated")
+    for name, before, after in zip(names, first, again[:4], strict=True):
+        if not np.array_equal(before, after):
+            found.fail(f"other {name} after coming back")
+    for j, world in enumerate(worlds):
+        envs.restore(j, world)
+    found.brought_back += 1
+
+
+def main() -> int:
+    """Play all cells, write the result, and say whether anything failed."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--steps", type=int, default=1_000_000, help="grid steps per grid and kind of action")
+    parser.add_argument("--grids", nargs="+", default=list(GRID_IDS), choices=GRID_IDS)
+    parser.add_argument("--kinds", nargs="+", default=list(KINDS), choices=KINDS)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    command = shlex.join(["python", "benchmarks/fuzz.py", *sys.argv[1:]])
+    result: dict[str, Any] = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+    cells = result["cells"] if result.get("command") == command else {}
+    each = -(-options.steps // len(SETTINGS))
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, TimeRemainingColumn(elapsed_when_finished=True)) as progress:
+        total = each * len(SETTINGS) * len(options.kinds) * len(options.grids)
+        bar = progress.add_task("grid steps", total=total)
+        for grid in options.grids:
+            for kind in options.kinds:
+                for setting in SETTINGS:
+                    name = f"{grid} {kind} {setting['heuristic'] or 'no heuristic'}"
+                    progress.update(bar, description=name)
+                    if name in cells:
+                        progress.advance(bar, each)
+                        continue
+                    found = play(grid, kind, setting, each, options.seed, lambda n: progress.advance(bar, n))
+                    cells[name] = vars(found) | {"game_overs": dict(sorted(found.game_overs.items()))}
+                    write_json(RESULTS, {"command": command, **_total(cells), "cells": cells}, indent=1)
+                    for words in found.examples:
+                        progress.console.print(f"{name}: {words}", markup=False)
+    print(f"{_total(cells)}")
+    return 1 if _total(cells)["failures"] else 0
+
+
+def _total(cells: dict[str, Any]) -> dict[str, int]:
+    names = ("grid_steps", "decisions", "episodes", "completed", "illegal", "brought_back", "failures")
+    return {name: sum(cell[name] for cell in cells.values()) for name in names}
+
+
+if __name__ == "__main__":
+    sys.exit(main())
