@@ -23,7 +23,6 @@ import gymnasium
 import numpy as np
 
 from rl2grid.records.files import write_json
-from rl2grid.scenarios.cache import data_folder
 
 RESULTS = Path(__file__).resolve().parent / "results" / "endurance.json"
 TASKS = (("bus14-T0", None), ("bus14-R", "idle"), ("bus36-MO-v0-T1", "careful"))
@@ -100,7 +99,6 @@ def main() -> int:
     tasks: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as scratch:
         data = Path(scratch)
-        (data / "numba").symlink_to(data_folder() / "numba")
         os.environ["RL2GRID_DATA"] = str(data)
         for task, heuristic in TASKS:
             tasks[task] = play(task, heuristic, options.num_envs, 60 * options.minutes / len(TASKS), data)

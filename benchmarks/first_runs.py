@@ -1,6 +1,6 @@
-"""Twenty first runs at once: programs that all find an empty data folder, and share it.
+"""Twenty first runs at once: programs that all find an empty data folder and no compiled code, and share both.
 
-``python benchmarks/first_runs.py [--number 20]`` starts so many programs at the same moment on one new data folder:
+``python benchmarks/first_runs.py [--number 20]`` starts so many programs at the same moment on one new folder:
 evaluations, trainings, a ranking and the making of months in turn. All must end well, those that do the same with the
 same, and nothing half written may stay. Writes ``benchmarks/results/first_runs.json``.
 """
@@ -29,7 +29,7 @@ NAMES = ("evaluate", "train ppo", "make months", "train sac", "rank")
 def start(subject: Subject, folder: Path, data: Path) -> subprocess.Popen[bytes]:
     """Start a program on the common data folder."""
     folder.mkdir()
-    environment = os.environ | {"RL2GRID_DATA": str(data)}
+    environment = os.environ | {"RL2GRID_DATA": str(data), "XDG_CACHE_HOME": str(data)}
     with folder.with_name(f"{folder.name}.log").open("wb") as log:
         return subprocess.Popen(
             [*PROGRAM, *subject.first(folder)], stdout=log, stderr=subprocess.STDOUT, env=environment

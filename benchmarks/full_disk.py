@@ -26,7 +26,6 @@ from typing import Any
 from kills import AT_MOST, SUBJECTS, Subject, call, log_of
 
 from rl2grid.records.files import write_json
-from rl2grid.scenarios.cache import data_folder
 
 RESULTS = Path(__file__).resolve().parent / "results" / "full_disk.json"
 INSIDE = "RL2GRID_OWN_MOUNTS"
@@ -90,12 +89,6 @@ def enlarge(folder: Path) -> None:
     subprocess.run(["mount", "-o", f"remount,size={ROOM}", str(folder)], check=True)
 
 
-def settle(folder: Path, subject: Subject) -> None:
-    """The compiled code of the present data folder, where the subject has a data folder of its own."""
-    if subject.own_data:
-        (folder / "numba").symlink_to(data_folder() / "numba")
-
-
 def taken(folder: Path) -> int:
     """Bytes in use."""
     status = os.statvfs(folder)
@@ -106,7 +99,6 @@ def run_subject(subject: Subject, number: int, folder: Path, draws: random.Rando
     """Let a subject run with room enough, then on so many disks that are full sooner or later."""
     found = Found()
     mount(folder, ROOM)
-    settle(folder, subject)
     call(subject.first(folder), subject, folder, AT_MOST)
     expected = json.dumps(subject.left(folder), sort_keys=True)
     found.bytes = taken(folder)
@@ -115,7 +107,6 @@ def run_subject(subject: Subject, number: int, folder: Path, draws: random.Rando
         found.disks += 1
         mount(folder, size)
         try:
-            settle(folder, subject)
             found.outcomes[_on_a_full_disk(subject, folder)] += 1
             enlarge(folder)
             call(subject.again(folder), subject, folder, AT_MOST)

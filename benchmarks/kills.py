@@ -31,7 +31,6 @@ from typing import Any
 from rl2grid.algorithms.policy_agent import load_agent
 from rl2grid.records.evaluations import load_evaluation
 from rl2grid.records.files import write_json
-from rl2grid.scenarios.cache import data_folder
 
 RESULTS = Path(__file__).resolve().parent / "results" / "kills.json"
 PROGRAM = (sys.executable, "-m", "rl2grid")
@@ -69,8 +68,9 @@ class Subject:
     left: Callable[[Path], Any]
     """What it leaves, to be compared."""
     own_data: bool = False
-    """Its data folder is the folder itself, with the compiled code of the present one unless ``cold``."""
+    """Its data folder is the folder itself."""
     cold: bool = False
+    """It finds no compiled code."""
     share: float = 1.0
     """How often it is killed, relative to others."""
 
@@ -187,6 +187,8 @@ def call(arguments: list[str], subject: Subject, folder: Path, until: float) -> 
     environment = dict(os.environ)
     if subject.own_data:
         environment["RL2GRID_DATA"] = str(folder)
+    if subject.cold:
+        environment["XDG_CACHE_HOME"] = str(folder)  # compiled code
     began = time.monotonic()
     log_file = log_of(folder)
     with log_file.open("wb") as log:
@@ -212,22 +214,20 @@ def log_of(folder: Path) -> Path:
     return folder.with_name(f"{folder.name}.log")
 
 
-def prepare(folder: Path, subject: Subject) -> None:
-    """An empty folder; with the compiled code of the present data folder where that is not what is looked at."""
+def prepare(folder: Path) -> None:
+    """An empty folder."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    if subject.own_data and not subject.cold:
-        (folder / "numba").symlink_to(data_folder() / "numba")
 
 
 def run_subject(subject: Subject, kills: int, folder: Path, draws: random.Random) -> Found:
     """Let a subject run in peace, then with so many kills."""
     found = Found()
-    prepare(folder, subject)
+    prepare(folder)
     found.seconds = round(call(subject.first(folder), subject, folder, AT_MOST), 1)
     expected = json.dumps(subject.left(folder), sort_keys=True)
     while found.kills < kills and len(found.failures) < 5:
-        prepare(folder, subject)
+        prepare(folder)
         command, found.runs = subject.first, found.runs + 1
         left_in_peace = draws.randrange(1, 6)
         try:
