@@ -8,6 +8,8 @@ import subprocess
 import sys
 from dataclasses import replace
 from importlib import resources
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -180,6 +182,25 @@ def test_an_interrupted_animation_leaves_no_file(tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         write_animation(tmp_path / "a.gif", interrupted())
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_encoder_that_ends_early_is_one_sentence_and_leaves_no_file(tmp_path, monkeypatch):
+    written = []
+
+    def encoder(path, *_, **__):
+        def taking():
+            Path(path).write_bytes(b"begun")
+            written.append((yield))
+            written.append((yield))
+            raise BrokenPipeError(32, "Broken pipe")
+
+        return taking()
+
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", SimpleNamespace(write_frames=encoder))
+    with pytest.raises(UsageError, match=r"ended early; is there room\?"):
+        write_animation(tmp_path / "a.mp4", [np.zeros((36, 64, 3), np.uint8)] * 3)
+    assert len(written) == 2
     assert not list(tmp_path.iterdir())
 
 

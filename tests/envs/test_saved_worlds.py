@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import rl2grid  # noqa: F401 - registers the tasks
+from rl2grid.engines import worlds
 from rl2grid.envs.vector import PowerGridVectorEnv
 from rl2grid.errors import UsageError
 from rl2grid.scenarios.library import list_scenarios
@@ -206,6 +207,16 @@ def test_saved_states_are_texts_and_numbers_and_show_what_was_shown():
     with pytest.raises(UsageError, match="not of this version"):
         other.load_state_dict({"rows": [{"seed": 1, "number": 0, "actions": [3, 4]}] * 2})
     assert other.state_dict() == vector.state_dict()
+
+
+def test_a_saved_state_that_expands_without_end_is_refused(monkeypatch: pytest.MonkeyPatch):
+    vector = PowerGridVectorEnv("bus14-T0", 1)
+    vector.reset(seed=1)
+    saved = vector.state_dict()
+    vector.load_state_dict(saved)
+    monkeypatch.setattr(worlds, "MAX_BYTES", 1000)
+    with pytest.raises(UsageError, match="not of this version"):
+        vector.load_state_dict(saved)
 
 
 @pytest.mark.parametrize("num_workers", [0, pytest.param(2, marks=pytest.mark.slow)])

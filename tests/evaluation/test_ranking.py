@@ -177,6 +177,13 @@ def test_what_is_there_is_not_tried_again(finished, monkeypatch, tmp_path):
     run_ranking("bus14", states=8, seed=3, output=tmp_path, work=finished.parent / "work")
 
 
+def test_a_ranking_of_another_kind_is_not_replaced(finished):
+    before = finished.read_bytes()
+    with pytest.raises(UsageError, match="made by 'rl2grid rank bus14 --states 8 --seed 3 --sampling exhaustive'"):
+        run_ranking("bus14", states=8, seed=4, output=finished.parent, work=finished.parent / "work")
+    assert finished.read_bytes() == before
+
+
 def test_uniform_sampling_tries_a_tenth(tmp_path):
     with np.load(run_ranking("bus14", 12, 3, "uniform", tmp_path, tmp_path / "work")) as arrays:
         share = arrays["trials"].sum() / (12 * 209)

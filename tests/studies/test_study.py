@@ -245,6 +245,16 @@ def environment() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": str(Path(rl2grid.__file__).parents[1])}
 
 
+def test_a_cell_on_a_full_disk_fails_with_a_sentence_and_may_be_tried_again():
+    code = (
+        "import errno, sys\nfrom rl2grid.studies.cell import serve\n"
+        "def do():\n    raise OSError(errno.ENOSPC, 'No space left on device', 'run/metrics.csv')\nsys.exit(serve(do))"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], env=environment(), capture_output=True, text=True, check=False)
+    assert ended.returncode == FAILED
+    assert ended.stderr == "rl2grid: run/metrics.csv cannot be read or written: No space left on device.\n"
+
+
 @pytest.mark.slow
 def test_an_interrupt_lets_the_cells_end_in_good_order(tmp_path: Path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", environment()["PYTHONPATH"])
