@@ -12,7 +12,7 @@ from rl2grid.cli.output import Output
 from rl2grid.envs.tasks import short_id
 from rl2grid.errors import UsageError
 from rl2grid.records.collection import Collection, collect
-from rl2grid.records.files import check_own, make_folder
+from rl2grid.records.files import make_own_folder
 from rl2grid.records.trainings import TrainingRun
 from rl2grid.scenarios.splits import SPLITS
 
@@ -47,8 +47,7 @@ def _run(options: argparse.Namespace, output: Output) -> int:
     number = len(plan.pictures)
     train_commands = _train_commands(collection.runs)
     path = options.output / PAGE_FILE
-    check_own(options.output, (PAGE_FILE,), "report")
-    make_folder(options.output)
+    make_own_folder(options.output, (PAGE_FILE,), "report")
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
     with output.progress(*columns, transient=True) as bar:
         task = bar.add_task("Drawing", total=number)

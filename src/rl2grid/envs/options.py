@@ -53,7 +53,7 @@ class TaskOptions:
     """A preset (``"default"``, ``"paper"``, ``"released"``), the weights of the three default components,
     or a function ``(state, i) -> (survive, overload, cost)``, compiled by Numba or plain Python."""
     split: str = field(default="train", metadata=_one_of(*SPLITS))
-    """Which scenarios are played: ``"train"`` (months without end), ``"validation"`` or ``"test"`` (20 months each), or
+    """Which scenarios are played: ``"train"`` (months without end), ``"validation"`` (200 months), ``"test"`` (500), or
     ``"bundled"``, the series inside the Grid2Op wheel."""
     scenario: str | None = None
     """Play this scenario only."""

@@ -235,6 +235,12 @@ def check_own(folder: Path, marks: Sequence[str], what: str) -> None:
         )
 
 
+def make_own_folder(folder: Path, marks: Sequence[str], what: str) -> None:
+    """:func:`make_folder`, unless it holds the files of somebody else (:func:`check_own`)."""
+    check_own(folder, marks, what)
+    make_folder(folder)
+
+
 def _shortened(value: Any) -> str:
     text = repr(value)
     return text if len(text) <= 40 else f"{text[:40]}..."

@@ -17,7 +17,7 @@ from typing import Any
 from rich.console import Console
 
 from rl2grid.errors import UsageError
-from rl2grid.records.files import check_own, make_folder
+from rl2grid.records.files import make_own_folder
 from rl2grid.records.locks import is_locked
 from rl2grid.records.studies import (
     CELLS_FOLDER,
@@ -51,9 +51,8 @@ def run_study(study: Study, backend: Backend, console: Console | None = None) ->
         UsageError: the study's folder holds cells of another definition; nothing was begun.
         KeyboardInterrupt: the user asked to stop; all cells have written their checkpoints.
     """
-    check_own(study.output, (STUDY_FILE, CELLS_FOLDER, "jobs"), "study")
     _check_same_study(study)
-    make_folder(study.output)
+    make_own_folder(study.output, (STUDY_FILE, CELLS_FOLDER, "jobs"), "study")
     for cell in study.cells:
         if (study.folder(cell)).exists():
             prepare(study.folder(cell), cell)

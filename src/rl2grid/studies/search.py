@@ -30,7 +30,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from rl2grid.algorithms.policy_agent import PolicyAgent
 from rl2grid.envs.tasks import find_task
 from rl2grid.errors import UsageError
-from rl2grid.records.files import check_own, make_folder
+from rl2grid.records.files import make_own_folder
 from rl2grid.records.locks import LockedError, is_locked
 from rl2grid.records.logs import LOG_FILE
 from rl2grid.records.metrics import read_validations
@@ -361,8 +361,7 @@ def _prepare(tuning: Tuning) -> None:
                     f"{tuning.output} holds a search with another {key}: remove it, or choose another folder with "
                     "--output."
                 )
-    check_own(tuning.output, (SEARCH_FILE, LOG_FILE), "search")
-    make_folder(tuning.output)
+    make_own_folder(tuning.output, (SEARCH_FILE, LOG_FILE), "search")
     write_search(tuning.output, wanted)
 
 
