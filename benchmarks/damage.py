@@ -45,7 +45,7 @@ from rl2grid.ledger.making import make_entry
 from rl2grid.records.collection import collect
 from rl2grid.records.entries import read_entry, write_entry
 from rl2grid.records.evaluation_folder import FolderStore
-from rl2grid.records.evaluations import load_evaluation, read_request
+from rl2grid.records.evaluations import load_evaluation, read_description
 from rl2grid.records.files import CHECKSUM, DamageWarning, write_json, write_record
 from rl2grid.records.ledger import add_test, hashed_test, read_ledger
 from rl2grid.records.searches import read_search, write_search
@@ -156,7 +156,7 @@ def _train(folder: Path, algorithm: str, seed: int) -> Path:
 def _make_partial(folder: Path) -> None:
     """An evaluation that was broken off before its last row."""
     episodes = load_evaluation(folder).episodes
-    described = read_request(folder / "evaluation.json")
+    described = read_description(folder).request
     shutil.rmtree(folder)
     store = FolderStore(folder, described, described["command"])
     for episode in episodes[:-1]:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from rich.console import Console
+from sample_folders import write_made_up_evaluation
 from sample_results import episode, result
 
 from rl2grid.analysis.summary_table import HEADINGS, markdown_table, summary_table
@@ -19,6 +21,7 @@ from rl2grid.records.metrics import read_validations
 from rl2grid.records.shares import wilson_interval
 from rl2grid.records.summary import by_scenario, summarise
 from rl2grid.records.trainings import read_training_curve
+from rl2grid.records.versions import processor
 
 
 def test_episodes_survive_a_file_digit_by_digit(tmp_path):
@@ -85,6 +88,12 @@ def test_a_month_alone_is_stored_without_the_ends_of_intervals(tmp_path):
     stored = json.loads((tmp_path / "evaluation.json").read_text(), parse_constant=pytest.fail)["summary"]
     assert stored["episode_return"] == {"value": 54.0, "low": None, "high": None}
     assert stored["survival"]["low"] < 0.6 < stored["survival"]["high"]
+
+
+def test_an_evaluation_names_the_processor_that_finished_it(tmp_path):
+    write_made_up_evaluation(tmp_path / "one")
+    assert load_evaluation(tmp_path / "one").processor == processor()
+    assert re.fullmatch(r"\w+ [\w-]+", processor())
 
 
 def test_the_interval_is_over_months():

@@ -21,7 +21,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 def _run(options: argparse.Namespace, output: Output) -> int:
     try:
         from rl2grid.analysis.summary_table import summary_table
-        from rl2grid.studies.demo import TASK, run_demo
+        from rl2grid.studies.demo import TASK, figures, published, run_demo, what_differs
     except ImportError as error:
         raise UsageError(
             f"The demonstration needs {error.name}: install it with `pip install rl2grid[train,analysis]`."
@@ -30,6 +30,8 @@ def _run(options: argparse.Namespace, output: Output) -> int:
     made = run_demo(options.output, decisions=options.decisions, progress=output.talks)
     summaries = [evaluation.summary for evaluation in made.evaluations]
     output.table(summary_table(summaries), [asdict(summary) for summary in summaries], title=f"{TASK}, test scenarios")
+    if options.decisions is None:
+        output.text(what_differs(figures(made.evaluations), published()))
     output.results(report=made.report)
     output.text(f"Report: {made.report} ({time.perf_counter() - began:.0f} s)")
     return 0

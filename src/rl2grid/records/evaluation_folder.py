@@ -18,7 +18,7 @@ from filelock import BaseFileLock
 
 from rl2grid.errors import UsageError
 from rl2grid.records.episodes import COLUMN_NAMES, EPISODES_FILE, Episode, format_row, parse_episodes, write_episodes
-from rl2grid.records.evaluations import EVALUATION_FILE, is_complete, read_finished, read_request, write_evaluation
+from rl2grid.records.evaluations import EVALUATION_FILE, read_description, read_finished, write_evaluation
 from rl2grid.records.files import (
     CHECKSUM,
     check_folder,
@@ -96,10 +96,11 @@ class FolderStore(Store):
     def _stored_episodes(self) -> tuple[Episode, ...]:
         if not (self._folder / EVALUATION_FILE).exists():
             return ()
-        _check_same_request(self._folder, self._request)
+        description = read_description(self._folder)
+        _check_same_request(self._folder, description.request, self._request)
         # A kill may have come between the rows and the description that vouches for them.
-        if self._finished.exists() and is_complete(self._folder):
-            return read_finished(self._folder)
+        if self._finished.exists() and description.complete:
+            return read_finished(self._folder, description)
         if not self._partial.exists():
             return ()
         self.episodes = self._partial_episodes()
@@ -126,7 +127,7 @@ class FolderStore(Store):
         """Refuse what another process wrote since this evaluation began, when there was no folder."""
         if not (self._folder / EVALUATION_FILE).exists():
             return
-        _check_same_request(self._folder, self._request)
+        _check_same_request(self._folder, read_description(self._folder).request, self._request)
         raise UsageError(
             f"Another process wrote this evaluation to {self._folder} meanwhile: ask again to go on with what it wrote."
         )
@@ -147,8 +148,7 @@ def _sealed_row(episode: Episode) -> str:
     return sealed_line(format_row(episode).removesuffix("\n")) + "\n"
 
 
-def _check_same_request(folder: Path, request: Mapping[str, Any]) -> None:
-    stored = read_request(folder / EVALUATION_FILE)
+def _check_same_request(folder: Path, stored: Mapping[str, Any], request: Mapping[str, Any]) -> None:
     mine, theirs = request["identity"], stored["identity"]
     differing = [key for key in {**theirs, **mine} if _plain(mine.get(key)) != theirs.get(key)]
     if not differing and stored["jobs"] != request["jobs"]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import hashlib
-import json
 import math
 import shlex
 from collections.abc import Mapping, Sequence
@@ -15,9 +14,10 @@ from typing import Any
 
 from rl2grid.errors import UsageError
 from rl2grid.records.episodes import EPISODES_FILE, Episode, read_episodes
-from rl2grid.records.files import read_json, write_record
+from rl2grid.records.files import checksum, read_json, write_record
 from rl2grid.records.statistics import Estimate
 from rl2grid.records.summary import Summary, summarise
+from rl2grid.records.versions import processor
 
 EVALUATION_FILE = "evaluation.json"
 _ROWS_HASH = "episodes_sha256"
@@ -28,6 +28,8 @@ _DESCRIPTION = {
     "complete": bool,
     "summary": (dict, NoneType),
 }
+_OF_THE_END = ("complete", "summary", _ROWS_HASH, "processor")
+"""What a description says besides the request."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,8 @@ class Evaluation:
     """What to type to obtain it again."""
     folder: Path | None = None
     """Where it is stored; None: nowhere."""
+    processor: str | None = None
+    """Kind of the processor on which it was finished; None: not stored."""
 
     @functools.cached_property
     def summary(self) -> Summary:
@@ -56,7 +60,7 @@ class Evaluation:
 
 def identity_hash(identity: Mapping[str, Any]) -> str:
     """Short hash of an identity, whatever the order of its entries."""
-    return hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:16]
+    return checksum(identity)
 
 
 def labels(identity: Mapping[str, Any]) -> dict[str, Any]:
@@ -82,6 +86,7 @@ def write_evaluation(path: Path, request: Mapping[str, Any], summary: Summary | 
         record["summary"] = {name: _plain(value) for name, value in vars(summary).items()}
         rows = path.with_name(EPISODES_FILE)
         record[_ROWS_HASH] = _file_hash(rows) if rows.is_file() else None
+        record["processor"] = processor()
     write_record(path, record)
 
 
@@ -96,25 +101,32 @@ def _plain(value: Any) -> Any:
     return {name: None if math.isnan(number) else number for name, number in asdict(value).items()}
 
 
-def read_request(path: Path) -> dict[str, Any]:
-    """What :func:`write_evaluation` was given as ``request``.
+@dataclass(frozen=True)
+class Description:
+    """What :func:`write_evaluation` wrote."""
+
+    request: Mapping[str, Any]
+    """``identity``, ``identity_hash``, ``jobs`` and ``command``."""
+    complete: bool
+    rows_hash: str | None
+    """SHA-256 of the file of its rows; None: not stored."""
+    processor: str | None
+    """See :class:`Evaluation`."""
+
+
+def read_description(folder: Path) -> Description:
+    """The description of the evaluation in a folder.
 
     Raises:
-        UsageError: the file is no description of an evaluation.
+        UsageError: there is none, or it was changed.
     """
-    record = _read_description(path)
-    for name in ("complete", "summary", _ROWS_HASH):
-        record.pop(name, None)
-    return record
-
-
-def _read_description(path: Path) -> dict[str, Any]:
-    remedy = "give a folder as 'rl2grid evaluate' wrote it"
+    path, remedy = folder / EVALUATION_FILE, "give a folder as 'rl2grid evaluate' wrote it"
     record: dict[str, Any] = read_json(path, "a description of an evaluation", remedy, _DESCRIPTION)
     stated = record.get("identity_hash")
     if stated not in (None, identity_hash(record["identity"])):
         raise UsageError(f"{path} was changed: its identity does not have the hash {stated!r}; {remedy}.")
-    return record
+    request = {name: value for name, value in record.items() if name not in _OF_THE_END}
+    return Description(request, record["complete"], record.get(_ROWS_HASH), record.get("processor"))
 
 
 def is_evaluation(folder: Path) -> bool:
@@ -130,35 +142,28 @@ def load_evaluation(folder: Path) -> Evaluation:
     """
     if not is_evaluation(folder):
         raise UsageError(f"{folder} holds no evaluation: give a folder that 'rl2grid evaluate' wrote.")
-    request = read_request(folder / EVALUATION_FILE)
+    description = read_description(folder)
+    request = description.request
     if not (folder / EPISODES_FILE).is_file():
         raise UsageError(f"The evaluation in {folder} is unfinished: continue it with {_continuing(request, folder)}.")
-    return Evaluation(read_finished(folder), request["identity"], request["command"], folder)
+    episodes = read_finished(folder, description)
+    return Evaluation(episodes, request["identity"], request["command"], folder, description.processor)
 
 
-def read_finished(folder: Path) -> tuple[Episode, ...]:
+def read_finished(folder: Path, description: Description) -> tuple[Episode, ...]:
     """The rows of a finished evaluation.
 
     Raises:
         UsageError: they are not those that its description was written for.
     """
-    path, stated = folder / EPISODES_FILE, _read_description(folder / EVALUATION_FILE).get(_ROWS_HASH)
+    path = folder / EPISODES_FILE
     episodes = read_episodes(path)
-    if stated not in (None, _file_hash(path)):
+    if description.rows_hash not in (None, _file_hash(path)):
         raise UsageError(
             f"{path} was changed since it was written, or belongs to another evaluation: restore it, or remove the "
             "folder and evaluate again."
         )
     return episodes
-
-
-def is_complete(folder: Path) -> bool:
-    """Whether an evaluation was finished, as its description says.
-
-    Raises:
-        UsageError: the folder holds none.
-    """
-    return bool(_read_description(folder / EVALUATION_FILE)["complete"])
 
 
 def _continuing(request: Mapping[str, Any], folder: Path) -> str:

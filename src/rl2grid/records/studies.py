@@ -18,7 +18,7 @@ from typing import Any
 from rl2grid.errors import UsageError
 from rl2grid.records.episodes import COLUMN_NAMES, EPISODES_FILE, format_row, read_episodes
 from rl2grid.records.evaluation_folder import PARTIAL_FILE
-from rl2grid.records.evaluations import EVALUATION_FILE, read_request
+from rl2grid.records.evaluations import is_evaluation, read_description
 from rl2grid.records.files import read_json, write_record, write_text
 
 STUDY_FILE, CELLS_FOLDER = "study.json", "cells"
@@ -85,8 +85,8 @@ def read_result(folder: Path) -> CellResult | None:
         return None
     stored = read_json(path, _PART, _REMEDY, _RESULT)
     result = CellResult(**{name: stored[name] for name in _RESULT})
-    evaluation = folder / EVALUATION_FOLDER / EVALUATION_FILE
-    request = read_request(evaluation) if evaluation.is_file() else {}
+    evaluation = folder / EVALUATION_FOLDER
+    request = read_description(evaluation).request if is_evaluation(evaluation) else {}
     if "identity_hash" in request and (request["identity_hash"], len(request["jobs"])) != (
         result.identity,
         result.episodes,

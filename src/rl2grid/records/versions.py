@@ -13,6 +13,13 @@ LIBRARIES: tuple[str, ...] = ("rl2grid", "grid2op", "lightsim2grid", "numba", "n
 """Packages whose version is part of the identity of a result."""
 
 
+def processor() -> str:
+    """The kind of processor, as compilers name it, as ``x86_64 znver4``; on one, results are equal to the last bit."""
+    from llvmlite.binding import get_host_cpu_name  # here: names of versions are wanted where nothing is compiled
+
+    return f"{platform.machine()} {get_host_cpu_name()}"
+
+
 def library_versions() -> dict[str, str]:
     """Versions of Python and of :data:`LIBRARIES`; packages that are not installed are left out."""
     versions = {"python": platform.python_version()}

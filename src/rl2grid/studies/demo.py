@@ -6,9 +6,13 @@ training goes on from its checkpoint, an evaluation with the episodes that are m
 
 from __future__ import annotations
 
+import json
 import shlex
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 from rich.console import Console
@@ -22,9 +26,10 @@ from rl2grid.evaluation.flags import evaluate_command, flags
 from rl2grid.evaluation.protocol import evaluate
 from rl2grid.evaluation.recording import record_episode
 from rl2grid.records.evaluations import Evaluation
-from rl2grid.records.files import check_own, make_folder
+from rl2grid.records.files import make_own_folder
 from rl2grid.records.recordings import Recording
 from rl2grid.records.trainings import read_training_curve
+from rl2grid.records.versions import library_versions, processor
 from rl2grid.scenarios.library import list_scenarios
 from rl2grid.training import request, runs
 from rl2grid.training.validation import validator
@@ -37,6 +42,8 @@ NUM_ENVS = 64
 """Enough to keep the cores busy while some environments play hours of calm between two decisions."""
 MONTHS = 100
 """Of the 500 test months: what a minute makes and plays."""
+PUBLISHED = "demo.json"
+"""Figures of the README, written by ``benchmarks/demonstration.py``."""
 SEEDS = (0,)
 """Of maintenance and of the random agent: episodes per test month."""
 
@@ -60,8 +67,7 @@ def run_demo(output: Path, decisions: int | None = None, *, progress: bool = Tru
     Raises:
         UsageError: ``decisions`` is too small, or ``output`` holds a training of another length.
     """
-    check_own(output, ("run", "report.html"), "demonstration")
-    make_folder(output)
+    make_own_folder(output, ("run", "report.html"), "demonstration")
     console = Console(stderr=True, quiet=not progress)
     register_all()
     console.rule("1/4 Training PPO with the idle heuristic on bus14", align="left")
@@ -96,6 +102,36 @@ def demo_command(output: Path, decisions: int | None) -> str:
     """What to type for :func:`run_demo` to be called like that."""
     length = {} if decisions is None else {"decisions": decisions}
     return shlex.join(["rl2grid", "demo", *flags({**length, "output": output})])
+
+
+def published() -> dict[str, Any]:
+    """The figures of the README: ``processor`` and ``versions`` that they hold on, ``survival`` by agent."""
+    text = resources.files("rl2grid.studies").joinpath(PUBLISHED).read_text(encoding="utf-8")
+    return dict(json.loads(text))
+
+
+def figures(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
+    """What :func:`published` holds, of a demonstration that was made here."""
+    survival = {each.summary.agent: each.summary.survival.value for each in evaluations}
+    return {"processor": processor(), "versions": library_versions(), "survival": survival}
+
+
+def what_differs(here: Mapping[str, Any], there: Mapping[str, Any]) -> str:
+    """How a demonstration compares with the published one, in a sentence or two."""
+    kinds = {"processor": there["processor"], **there["versions"]}
+    mine = {"processor": here["processor"], **here["versions"]}
+    other = [
+        f"{name} {kinds[name]} there, {mine.get(name, 'none')} here" for name in kinds if kinds[name] != mine.get(name)
+    ]
+    changed = [
+        f"{agent} {there['survival'][agent]:.3f} there, {value:.3f} here"
+        for agent, value in here["survival"].items()
+        if value != there["survival"].get(agent)
+    ]
+    if not changed:
+        return f"The same survival as in the README, to the last bit (made on {there['processor']})."
+    reasons = f"What else differs: {'; '.join(other)}." if other else "Processor and versions are the same."
+    return f"Other survival than in the README: {'; '.join(changed)}. {reasons}"
 
 
 def _contestants(run: Path) -> list[tuple[str, str | None]]:

@@ -38,6 +38,7 @@ from rl2grid.errors import UsageError
 from rl2grid.records import logs
 from rl2grid.records.locks import LockedError, locked
 from rl2grid.records.trainings import RUN_FILE, create_run_folder
+from rl2grid.records.versions import processor
 from rl2grid.training.energy import EnergyAccount
 from rl2grid.training.interrupts import stop_requests
 from rl2grid.training.limits import TimeLimit
@@ -276,7 +277,8 @@ def _run(run: _Run, envs: VectorEnvironment, limit: TimeLimit, checkpoint: Mappi
     trainer.store_in(run.folder / REPLAY_FOLDER)
     if checkpoint is not None:
         run.load(checkpoint)
-    run.note(f"{'resumed' if checkpoint else 'started'} at {trainer.decisions} of {_budget(args, trainer)} decisions")
+    begun = "resumed" if checkpoint else "started"
+    run.note(f"{begun} at {trainer.decisions} of {_budget(args, trainer)} decisions on {processor()}")
     after_step = trainer.decisions if checkpoint is not None else -1
     saved_at, saved_decisions = time.monotonic(), trainer.decisions
     config = {"request": stored_request(args), "identity": dict(run.identity)}
