@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+import numpy as np
 import platformdirs
 
 from rl2grid import compile_notices
@@ -79,3 +80,13 @@ def owning_jit(function: Function) -> Function:
     compiled: Any = jit(function)
     compiled.targetoptions[_RUNTIME] = True
     return cast(Function, compiled)
+
+
+def int64(value: int) -> int:
+    """A number for compiled code that is no literal: for each literal of a call, Numba compiles what is called anew."""
+    return cast(int, np.int64(value))
+
+
+def boolean(value: int) -> bool:
+    """:func:`int64` for True and False."""
+    return cast(bool, np.bool_(value))

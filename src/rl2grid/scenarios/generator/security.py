@@ -9,9 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rl2grid.arrays import F32, I32, I64
-from rl2grid.compile import jit
+from rl2grid.arrays import F32, F64, I32, I64
+from rl2grid.compile import int64, jit
 from rl2grid.grids import Grid
+from rl2grid.handles import Handle, opener
 from rl2grid.powerflow.ac import CONVERGED, FlowState, new_flow_state, run_flow, write_currents, write_flow
 from rl2grid.powerflow.model import Network, load_network
 from rl2grid.scenarios.generator.arithmetic import rounded
@@ -22,10 +23,13 @@ class _Rows(threading.local):
     """Rows of power flows, one for each grid; every thread has its own."""
 
     def __init__(self) -> None:
-        self.of_grid: dict[Grid, FlowState] = {}
+        self.of_grid: dict[Grid, Handle[FlowState]] = {}
 
 
 _ROWS = _Rows()
+_ROW = int64(0)
+"""The row that is solved. Engines give the power flow the same types: it is compiled once for all."""
+_open_network, _open_flow = opener(Network), opener(FlowState)
 
 
 class Verdict(NamedTuple):
@@ -56,10 +60,10 @@ def assess(grid: Grid, voltage: F32 | None, active: I32, reactive: I32, producti
     losses, rows = np.zeros(len(active), np.int64), len(active)
     slack, loading = np.zeros(rows, np.float32), np.zeros(rows, np.float32)
     converged = _assess(
-        network,
-        _blank_flow(grid),
+        _network_of(grid).address,
+        _blank_flow(grid).address,
         np.ones(grid.dim_topo, np.int32),
-        setpoint.astype(np.float32),
+        setpoint.astype(np.float32).astype(np.float64),
         np.zeros(grid.n_storage, np.float32),
         grid.thermal_limit,
         active,
@@ -72,12 +76,17 @@ def assess(grid: Grid, voltage: F32 | None, active: I32, reactive: I32, producti
     return Verdict(bool(converged), losses, slack, loading)
 
 
-def _blank_flow(grid: Grid) -> FlowState:
+@functools.cache
+def _network_of(grid: Grid) -> Handle[Network]:
+    return Handle(load_network(grid))
+
+
+def _blank_flow(grid: Grid) -> Handle[FlowState]:
     """A row of this thread that remembers no flow: the next one is solved cold."""
     rows = _ROWS.of_grid
     if grid not in rows:
-        rows[grid] = copy.deepcopy(_cold_flow(grid))
-    copy_row(_cold_flow(grid), 0, rows[grid], 0)
+        rows[grid] = Handle(copy.deepcopy(_cold_flow(grid)))
+    copy_row(_cold_flow(grid), 0, rows[grid].structure, 0)
     return rows[grid]
 
 
@@ -89,10 +98,10 @@ def _cold_flow(grid: Grid) -> FlowState:
 
 @jit
 def _assess(
-    network: Network,
-    flow: FlowState,
+    network_address: int,
+    flow_address: int,
     topology: I32,
-    setpoint: F32,
+    setpoint: F64,
     storage: F32,
     limit: F32,
     active: I32,
@@ -102,6 +111,7 @@ def _assess(
     slack: F32,
     loading: F32,
 ) -> bool:
+    network, flow = _open_network(network_address), _open_flow(flow_address)
     load_p, load_q = np.empty(active.shape[1], np.float32), np.empty(active.shape[1], np.float32)
     gen_p, solved = np.empty(production.shape[1], np.float32), np.empty(production.shape[1], np.float32)
     current, line_p = np.empty(limit.size, np.float32), np.empty(limit.size, np.float32)
@@ -117,10 +127,10 @@ def _assess(
             gen_p[gen] = production[row, gen] / 10.0
             if gen != balancing:
                 balance += production[row, gen]
-        if run_flow(network, flow, 0, topology, gen_p, setpoint, load_p, load_q, storage) != CONVERGED:
+        if run_flow(network, flow, _ROW, topology, gen_p, setpoint, load_p, load_q, storage) != CONVERGED:
             return False
-        write_currents(network, flow, 0, current)
-        write_flow(network, flow, 0, line_p, solved, gen_angle, load_angle, storage_angle)
+        write_currents(network, flow, _ROW, current)
+        write_flow(network, flow, _ROW, line_p, solved, gen_angle, load_angle, storage_angle)
         slack[row] = solved[balancing]
         losses[row] = balance + rounded(10.0 * solved[balancing])
         for line in range(limit.size):
