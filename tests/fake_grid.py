@@ -46,7 +46,7 @@ class FakeGrid(gymnasium.Env[Any, Any]):
         self.step_listeners: list[Any] = []
         self.task = SimpleNamespace(id="fake")
         self.grid = SimpleNamespace(name_line=tuple(f"line {k}" for k in range(N_LINES)), n_line=N_LINES)
-        self.options = SimpleNamespace(heuristic=heuristic)
+        self.options = SimpleNamespace(heuristic=heuristic, engine="fake")
         self._log, self._fail_on, self._exit_on, self._delay = log, fail_on, exit_on, delay
 
     @property
@@ -85,6 +85,8 @@ class FakeGrid(gymnasium.Env[Any, Any]):
             gen_p=np.zeros((1, 1), np.float32),
             load_p=np.zeros((1, 1), np.float32),
             storage_power=np.zeros((1, 0), np.float32),
+            p_or=np.zeros((1, N_LINES), np.float32),
+            gen_p_before_curtail=np.zeros((1, 1), np.float32),
             step=np.zeros(1, np.int32),
             episode_length=np.full(1, LENGTH, np.int32),
             terminated=np.zeros(1, np.bool_),

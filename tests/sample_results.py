@@ -117,5 +117,5 @@ def recording(n_steps: int = 700, n_line: int = 6, game_over: str = "the grid fe
         attacked,
         np.zeros_like(status),
         np.ones((n_steps + 1, 2 * n_line), np.int8),
-        *(np.zeros((n_steps + 1, n), np.float32) for n in (2, 3, 1)),
+        *(np.zeros((n_steps + 1, n), np.float32) for n in (2, 3, 1, n_line, 2)),
     )

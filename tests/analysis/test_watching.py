@@ -56,6 +56,8 @@ def made_up(grid, n_steps, game_over="a load was cut off from the grid"):
         gen_p=random.uniform(0, 50, (n_steps + 1, grid.n_gen)).astype(np.float32),
         load_p=random.uniform(0, 50, (n_steps + 1, grid.n_load)).astype(np.float32),
         storage_power=np.zeros((n_steps + 1, grid.n_storage), np.float32),
+        p_or=random.uniform(-50, 50, shape).astype(np.float32),
+        gen_p_before_curtail=random.uniform(0, 50, (n_steps + 1, grid.n_gen)).astype(np.float32),
     )
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import gymnasium
 import numpy as np
@@ -54,6 +54,25 @@ class SpecialisedAgent(Protocol):
 
     kinds: tuple[str, ...]
     """``"T"``: topology tasks, ``"R"``: redispatching tasks; ``bind`` refuses the others."""
+
+
+class Considered(NamedTuple):
+    """What an agent thought of actions when it acted."""
+
+    meaning: str
+    """What the values are, for example ``probability``."""
+    actions: Sequence[Action]
+    """Best first; a few are enough."""
+    values: Sequence[float]
+    """Of each of them."""
+
+
+@runtime_checkable
+class ExplainingAgent(Protocol):
+    """An agent that says between which actions it chose; ``rl2grid watch`` shows it."""
+
+    def explain(self) -> Considered | None:
+        """What the last ``act`` thought of; None: there was nothing to choose."""
 
 
 def no_intervention(space: gymnasium.Space[Any]) -> Action:

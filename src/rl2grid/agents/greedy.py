@@ -7,7 +7,7 @@ from typing import Any
 
 import gymnasium
 
-from rl2grid.agents.agent import Action, Agent, Info, Observation
+from rl2grid.agents.agent import Action, Agent, Considered, ExplainingAgent, Info, Observation
 from rl2grid.agents.greedy_dispatch import GreedyDispatch
 from rl2grid.agents.greedy_topology import GreedyTopology
 from rl2grid.errors import UsageError
@@ -43,6 +43,10 @@ class Greedy:
     def act(self, observation: Observation, info: Info) -> Action:
         """The best action; the one that changes nothing where none is better."""
         return self._search.act(observation, info)
+
+    def explain(self) -> Considered | None:
+        """What was tried, on redispatching tasks; on topology tasks that is what every action promises."""
+        return self._search.explain() if isinstance(self._search, ExplainingAgent) else None
 
     def _search_of(self, space: gymnasium.Space[Any]) -> Agent:
         if isinstance(space, gymnasium.spaces.Discrete):

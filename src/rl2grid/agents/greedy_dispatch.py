@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rl2grid.agents.agent import Action, Info, Observation
+from rl2grid.agents.agent import Action, Considered, Info, Observation
 from rl2grid.agents.dc_flow import buses, dc_point, sensitivities
 from rl2grid.agents.dispatch import (
     Control,
@@ -65,15 +65,27 @@ class GreedyDispatch(DispatchAgent):
     def act(self, observation: Observation, info: Info) -> Action:
         """The action with the least worst loading on the forecast; zeros where none is better."""
         state: GridState = self._env.state
+        self._remember([], np.zeros(0))
         if not is_safe(state, 0):
             return self._relieve(state)
         return self._give_back(state) if anything_dispatched(state) else self._nothing.copy()
+
+    def explain(self) -> Considered | None:
+        """The actions that the last decision tried on the forecast, the least loaded first; None: it tried none."""
+        if not self._tried:
+            return None
+        order = np.argsort(self._promised, kind="stable")
+        return Considered("worst loading", [self._tried[k] for k in order], self._promised[order].tolist())
+
+    def _remember(self, tried: list[Action], promised: F64) -> None:
+        self._tried, self._promised = tried, promised
 
     def _relieve(self, state: GridState) -> Action:
         control = controls(state, self._grid)
         plans = [control.now, *self._plans(state, control)]
         actions = [self._nothing.copy(), *(encode(state, self._grid, plan) for plan in plans)]
         loadings = np.array([worst_loading(self._env, action) for action in actions])
+        self._remember(actions, loadings)
         prices = np.array([0.0, *(float(control.price @ np.abs(plan - control.at_rest)) for plan in plans)])
         enough = (loadings < _ENOUGH) & (loadings < loadings[0] - _WORTHWHILE)
         best = int(np.where(enough, prices, np.inf).argmin() if enough.any() else loadings.argmin())
@@ -92,6 +104,7 @@ class GreedyDispatch(DispatchAgent):
             loadings.append(worst_loading(self._env, actions[-1]))
             if loadings[-1] < _CALM:
                 break
+        self._remember(actions, np.array(loadings))
         return actions[int(np.argmin(loadings))]
 
     def _can_be_followed(self, state: GridState, change: F64) -> bool:

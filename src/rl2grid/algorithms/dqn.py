@@ -180,6 +180,7 @@ class QNetwork(nn.Module):
     """The value of every action."""
 
     continuous = False
+    preference = "value"
 
     def __init__(self, networks: NetworkFactory, layers: Sequence[int], head: str = SINGLE, count: int = 1) -> None:
         super().__init__()
@@ -203,6 +204,11 @@ class QNetwork(nn.Module):
     def act(self, observations: Tensor, masks: Tensor | None, generator: torch.Generator | None) -> Tensor:
         """The best legal actions for observations [batch, size], int64 [batch]; ``generator`` has nothing to draw."""
         return best_actions(self(observations), masks)
+
+    def preferences(self, observations: Tensor, masks: Tensor | None) -> Tensor:
+        """Values of the actions, [batch, actions]; of illegal ones large and negative."""
+        values: Tensor = self(observations)
+        return values if masks is None else values.masked_fill(~masks, ILLEGAL)
 
 
 def best_actions(values: Tensor, masks: Tensor | None) -> Tensor:

@@ -101,6 +101,8 @@ _ILLEGAL_LOGIT = -1e8
 class ActorCritic(nn.Module):
     """The policy, the value function, and a value function of every cost: separate networks."""
 
+    preference = "probability"
+
     def __init__(
         self,
         networks: NetworkFactory,
@@ -154,6 +156,10 @@ class ActorCritic(nn.Module):
             return log_probabilities.argmax(dim=-1)
         actions = torch.multinomial(log_probabilities.exp().cpu(), 1, generator=generator)
         return actions.squeeze(-1).to(output.device)
+
+    def preferences(self, observations: Tensor, masks: Tensor | None) -> Tensor:
+        """Probabilities of discrete actions, [batch, actions]."""
+        return _log_probabilities(self.actor(observations), masks).exp()
 
     def log_probability_and_entropy(
         self, observations: Tensor, actions: Tensor, masks: Tensor | None

@@ -13,7 +13,7 @@ import gymnasium
 import numpy as np
 import torch
 
-from rl2grid.agents.agent import Action, Info, Observation
+from rl2grid.agents.agent import Action, Considered, Info, Observation
 from rl2grid.algorithms.checkpoint import load_checkpoint
 from rl2grid.algorithms.registry import find_algorithm
 from rl2grid.envs.normalization import ObservationNormalizer
@@ -27,6 +27,8 @@ BEST_FILE = "best.pt"
 """In a run folder: the policy with the highest validation survival so far."""
 CHECKPOINT_FILE = "checkpoint.pt"
 """In a run folder: everything needed to go on."""
+_EXPLAINED = 8
+"""Actions of which an explanation tells."""
 MAX_WEIGHT = 1e8
 """A larger one is no weight that was learned."""
 SMALL_NETWORK = 2**24
@@ -111,9 +113,23 @@ class PolicyAgent:
         with torch.no_grad():
             observations = torch.as_tensor(observation, dtype=torch.float32).unsqueeze(0)
             actions = self._network.act(observations, masks, None if self.deterministic else self._generator)
+        self._seen = observations, masks
         if self._network.continuous:
             return actions[0].clamp(-1.0, 1.0).numpy()
         return int(actions[0])
+
+    def explain(self) -> Considered | None:
+        """The best actions of the last decision by the policy's probabilities or values; None if they are continuous.
+
+        A network says them with ``preferences(observations, masks)``, which returns [batch, actions], and calls them
+        ``preference``.
+        """
+        if self._network.continuous or not hasattr(self._network, "preferences"):
+            return None
+        with torch.no_grad():
+            values = self._network.preferences(*self._seen)[0]
+        best = values.topk(min(_EXPLAINED, len(values)))
+        return Considered(self._network.preference, best.indices.tolist(), best.values.tolist())
 
 
 def load_agent(

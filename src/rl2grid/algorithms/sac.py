@@ -221,6 +221,7 @@ class CategoricalActor(nn.Module):
     """Probabilities of discrete actions."""
 
     continuous = False
+    preference = "probability"
 
     def __init__(
         self, networks: NetworkFactory, layers: Sequence[int], initial_do_nothing: float | None = None
@@ -246,6 +247,11 @@ class CategoricalActor(nn.Module):
         # Drawn on the processor, where the generator is.
         probabilities = log_probabilities.exp().cpu()
         return torch.multinomial(probabilities, 1, generator=generator).squeeze(-1)
+
+    def preferences(self, observations: Tensor, masks: Tensor | None) -> Tensor:
+        """Probabilities of the actions, [batch, actions]."""
+        log_probabilities: Tensor = self(observations, masks)
+        return log_probabilities.exp()
 
 
 class TwinActionCritics(nn.Module):

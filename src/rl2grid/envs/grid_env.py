@@ -8,6 +8,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from rl2grid.engines.base import Engine
 from rl2grid.engines.transition import Listener
 from rl2grid.engines.worlds import World
 from rl2grid.envs.closed import closed
@@ -113,6 +114,11 @@ class PowerGridEnv(RowMethods, gymnasium.Env[NDArray[np.float32], Any]):
     def state(self) -> GridState:
         """The grid after the last step, in physical units: row 0 of each array. To be looked at, not written to."""
         return self._environments.state
+
+    @property
+    def engine(self) -> Engine:
+        """What simulates the grid, in row 0. To be looked at, not written to."""
+        return self._environments.engine
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -39,7 +39,13 @@ def collapse(state: GridState, i: int, overloads: str) -> Collapse:
 
 
 def _cut_off(state: GridState, i: int) -> NDArray[np.bool_]:
-    """[sub] whether a load or generator there is off, or something there is not connected to the balancing generator.
+    """[sub] whether it has one of the :func:`lost_elements`."""
+    return np.bincount(state.element_to_subid, lost_elements(state, i), len(state.sub_info)) > 0
+
+
+def lost_elements(state: GridState, i: int) -> NDArray[np.bool_]:
+    """[topo] loads and generators that the game over of row ``i`` left off, and whatever the balancing generator does
+    not reach.
 
     A storage unit or the end of a line may be off.
     """
@@ -54,8 +60,7 @@ def _cut_off(state: GridState, i: int) -> NDArray[np.bool_]:
     apart = np.ones(len(topology), np.bool_) if balancing < 0 else piece[busbar] != piece[balancing]
     vital = np.zeros(len(topology), np.bool_)
     vital[state.load_pos_topo_vect] = vital[state.gen_pos_topo_vect] = True
-    lost = np.where(busbar < 0, vital, apart)
-    return np.bincount(sub, lost, n_sub) > 0
+    return np.where(busbar < 0, vital, apart)
 
 
 def _ids(flags: NDArray[np.bool_]) -> str:
