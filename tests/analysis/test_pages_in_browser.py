@@ -43,7 +43,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def watch(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("page") / "watch.html"
     grid = load_grid("bus14")
-    write_watch_page(path, grid, made_up(grid, 40))
+    write_watch_page(path, grid, [made_up(grid, 40)])
     return path
 
 

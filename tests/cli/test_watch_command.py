@@ -17,10 +17,25 @@ def test_an_episode_is_written_as_page_and_animation(capsys, tmp_path):
         assert pictures.n_frames == 3
 
 
+def test_others_play_the_same_month_on_the_same_page(capsys, tmp_path):
+    command_line = ["watch", "do-nothing", "bus14-T0", "--against", "greedy", "--split", "bundled", "--steps", "4"]
+    assert main([*command_line, "--every", "4", "--output", str(tmp_path)]) == 0
+    output = capsys.readouterr().out
+    assert "do-nothing: 4 of " in output
+    assert "greedy: 4 of " in output
+    assert [path.name for path in sorted(tmp_path.iterdir())] == [
+        "bus14-T0-v0-1-do-nothing-bundled-0000-0.gif",
+        "bus14-T0-v0-2-greedy-bundled-0000-0.gif",
+        "bus14-T0-v0-do-nothing-against-greedy-bundled-0000-0.html",
+    ]
+
+
 @pytest.mark.parametrize(
     ("flags", "words"),
     [
         (["genius", "bus14-T0"], "choose one of do-nothing"),
+        (["do-nothing", "bus14-T0", "--against", "genius"], "choose one of do-nothing"),
+        (["do-nothing", "bus14-T0", "--against", "dc-opf"], "dc-opf"),
         (["do-nothing", "bus14-T0", "--steps", "0"], "steps=0 is not allowed"),
         (["do-nothing", "bus14-T0", "--every", "0"], "every=0 is not allowed"),
         (["do-nothing", "bus14-T0", "--seed", "-1"], "seed=-1 is not allowed"),

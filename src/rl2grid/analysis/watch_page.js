@@ -1,249 +1,393 @@
 "use strict";
-// Decodes an episode and says what the grid looks like at a step; what draws it on the page is below.
+// The page: one moment of time, the maps, the charts, and what is said about it.
 
-function bytesOf(text) {
-  const raw = atob(text), bytes = new Uint8Array(raw.length);
-  for (let k = 0; k < raw.length; k++) bytes[k] = raw.charCodeAt(k);
-  return bytes;
+const at = id => document.getElementById(id);
+
+function made(tag, parent, attributes = {}, words = "") {
+  const node = document.createElement(tag);
+  Object.assign(node, attributes);
+  if (words) node.textContent = words;
+  parent.appendChild(node);
+  return node;
 }
 
-class Episode {
-  constructor(data) {
-    Object.assign(this, data);
-    this.rho = bytesOf(data.rho);
-    this.power = bytesOf(data.power);
-    this.nLine = data.grid.lines.length;
-    this.nSymbol = data.grid.symbols.length;
-    this.step = -1;
-    this.seek(0);
-  }
+// Percent: from here on heuristics hand over to the agent.
+const ALARM = 95;
 
-  // Changes are replayed: forwards from where we are, backwards from the beginning.
-  seek(step) {
-    if (this.step < 0 || step < this.step) {
-      this.topology = this.grid.elementSub.map(() => 1);
-      this.next = 0;
-    }
-    for (; this.next < this.changes.length && this.changes[this.next][0] <= step; this.next++) {
-      const moved = this.changes[this.next][1];
-      for (let k = 0; k < moved.length; k += 2) this.topology[moved[k]] = moved[k + 1];
-    }
-    this.step = step;
-  }
-
-  loading(line, step = this.step) { return this.rho[step * this.nLine + line]; }
-
-  worst(step) {
-    let best = 0;
-    for (let line = 1; line < this.nLine; line++) if (this.loading(line, step) > this.loading(best, step)) best = line;
-    return best;
-  }
-
-  megawatts(symbol) { return this.largest * (this.power[this.step * this.nSymbol + symbol] / 255) ** 2; }
-
-  within(intervals, line) { return intervals.some(([l, from, to]) => l === line && from <= this.step && this.step < to); }
-
-  isOn(line) { const [, , origin, extremity] = this.grid.lines[line]; return this.topology[origin] > 0 && this.topology[extremity] > 0; }
-
-  splitSubstations() {
-    const split = new Set();
-    this.topology.forEach((busbar, element) => { if (busbar === 2) split.add(this.grid.elementSub[element]); });
-    return split;
-  }
-
-  // Where an element ends at its substation, and the point before: round the end of the busbar in between.
-  end(element, split) {
-    const sub = this.grid.elementSub[element], [x, y] = this.grid.centres[sub];
-    if (!split.has(sub)) return [[x, y], [x, y]];
-    const [bar, gap] = [0.3, 0.19], [tx, ty] = this.grid.towards[element];
-    const above = this.topology[element] === 2 ? -1 : 1, side = tx >= 0 ? 1 : -1;
-    const behind = ty * above < -0.25;
-    const along = (behind ? 0.92 * side : Math.max(-0.92, Math.min(0.92, 1.1 * tx))) * bar;
-    const end = [x + along, y + above * gap];
-    return [end, behind ? [x + side * (bar + 0.1), y - above * gap] : end];
-  }
-
-  lineCourse(line, split) {
-    const [, , origin, extremity] = this.grid.lines[line], [near, far] = this.grid.middles[line];
-    const [a, b] = this.end(origin, split), [z, y] = this.end(extremity, split);
-    return [a, b, near, far, y, z];
-  }
-
-  decisionBefore(step) {
-    let found = -1;
-    for (let k = 0; k < this.decisions.length && this.decisions[k][0] < step; k++) if (this.decisions[k][1]) found = k;
-    return found;
-  }
-
-  time(step) {
-    const when = new Date(Date.parse(this.began + "Z") + step * 300000);
-    return when.toLocaleString("en-GB", { timeZone: "UTC", weekday: "short", day: "2-digit", month: "short", hour: "2-digit", minute: "2-digit" });
-  }
-}
+// Loadings of the series end at 255%.
+function percentOf(loading) { return loading === 255 ? "255% or more" : `${loading}%`; }
 
 class Page {
-  constructor(episode) {
-    this.episode = episode;
+  constructor(episodes, data) {
+    Object.assign(this, { episodes, colours: data.colours, grid: data.grid, chosen: 0, step: 0, round: Infinity });
     this.dark = matchMedia("(prefers-color-scheme: dark)");
-    this.build();
-    this.dark.addEventListener("change", () => this.show(this.episode.step));
-    addEventListener("resize", () => this.show(this.episode.step));
-    addEventListener("keydown", event => this.key(event));
-    const last = episode.steps - 1;
-    this.slider = this.at("slider");
-    this.slider.max = last;
+    this.last = Math.max(...episodes.map(episode => episode.last));
+    this.axis = this.last + 1;
+    this.view = new View(this.grid.centres);
+    this.makeMaps();
+    this.makeCharts();
+    this.makeTools();
+    this.makeControls();
+    this.choose(0);
+    this.layOut(episodes.length > 1 ? "all" : "0");
+    this.show(this.stepOfAddress());
+  }
+
+  get episode() { return this.episodes[this.chosen]; }
+
+  stepOfAddress() {
+    const named = Number(location.hash.slice(1));
+    return Number.isInteger(named) ? Math.max(0, Math.min(this.last, named)) : 0;
+  }
+
+  makeMaps() {
+    this.maps = this.episodes.map((episode, k) => {
+      const figure = made("figure", at("maps"), { className: "map" }), caption = made("figcaption", figure);
+      made("b", caption, {}, episode.label);
+      const state = made("span", caption);
+      caption.addEventListener("click", () => this.choose(k));
+      const svg = svgNode("svg", figure, { role: "img", "aria-label": `The grid, played by ${episode.label}` });
+      const map = new GridMap(svg, episode, this.colours, this.view, thing => { this.choose(k); this.select(thing); });
+      return Object.assign(map, { figure, state });
+    });
+    this.tabs = this.episodes.length < 2 ? [] : this.episodes.map((episode, k) => {
+      const tab = made("button", at("tabs"), { title: episode.label }, episode.label);
+      tab.addEventListener("click", () => this.choose(k));
+      return tab;
+    });
+  }
+
+  makeCharts() {
+    const place = at("timeline"), seek = step => { this.pause(); this.show(step); };
+    const add = (name, words, paint) => {
+      const label = made("div", place, { className: "words" });
+      label.innerHTML = words;
+      const canvas = made("canvas", place, { className: name });
+      canvas.setAttribute("aria-label", name);
+      return Object.assign(new Chart(canvas, this.axis, seek, paint), { label });
+    };
+    this.loadings = this.episodes.map(episode => {
+      const paint = (...to) => paintLoading(episode, this.shades, this.thing, this.axis)(...to);
+      const chart = add("loading", "<b></b><br><span></span>", paint);
+      chart.label.firstChild.textContent = episode.label;
+      return chart;
+    });
+    // Demand and weather are the same for all: those of whoever lives longest are known longest.
+    const longest = this.episodes.reduce((best, each) => each.steps > best.steps ? each : best);
+    this.mix = add("mix", "", (...to) => paintMix(this.episode, longest, this.axis)(...to));
+    this.weather = add("weather", "", (...to) => paintWeather(this.episode, longest, this.axis)(...to));
+    this.charts = [...this.loadings, this.mix, this.weather];
+    addEventListener("resize", () => { this.arrange(); this.repaint(); });
+    this.dark.addEventListener("change", () => { this.repaint(); this.draw(); });
+  }
+
+  repaint() { for (const chart of this.charts) chart.repaint(); }
+
+  get shades() { return this.colours[this.dark.matches ? "dark" : "light"]; }
+
+  makeTools() {
+    for (const { kind, number, name } of thingsOf(this.grid)) made("option", at("things"), { value: `${kind} ${number} (${name})` });
+    at("search").addEventListener("input", event => this.select(findThing(this.grid, event.target.value), true));
+    at("names").addEventListener("change", event => { for (const map of this.maps) map.label(event.target.value); });
+    at("flows").addEventListener("click", () => this.toggleFlows());
+    at("in").addEventListener("click", () => this.view.zoom(1.5));
+    at("out").addEventListener("click", () => this.view.zoom(1 / 1.5));
+    at("fit").addEventListener("click", () => this.view.fit());
+    if (this.episodes.length < 2) return;
+    at("layout").hidden = false;
+    made("option", at("layout"), { value: "all" }, "Side by side");
+    this.episodes.forEach((episode, k) => made("option", at("layout"), { value: k }, episode.label));
+    at("layout").addEventListener("change", event => this.layOut(event.target.value));
+  }
+
+  makeControls() {
+    this.slider = at("slider");
+    this.slider.max = this.last;
     this.slider.addEventListener("input", () => { this.pause(); this.show(+this.slider.value); });
-    this.at("play").addEventListener("click", () => this.timer ? this.pause() : this.play());
-    this.at("strip").addEventListener("click", event => {
-      const box = this.at("strip").getBoundingClientRect();
-      this.show(Math.round((event.clientX - box.left) / box.width * last));
-    });
-    const named = +location.hash.slice(1);
-    this.show(Number.isInteger(named) ? Math.max(0, Math.min(last, named)) : 0);
+    at("play").addEventListener("click", () => this.timer ? this.pause() : this.play());
+    at("earlier").addEventListener("click", () => { this.pause(); this.show(this.step, Math.max(0, this.episode.round - 1)); });
+    at("later").addEventListener("click", () => { this.pause(); this.show(this.step, this.episode.round + 1); });
+    addEventListener("keydown", event => this.key(event));
+    addEventListener("hashchange", () => this.show(this.stepOfAddress()));
   }
 
-  at(id) { return document.getElementById(id); }
-
-  svg(tag, parent, attributes = {}) {
-    const node = document.createElementNS("http://www.w3.org/2000/svg", tag);
-    for (const name in attributes) node.setAttribute(name, attributes[name]);
-    parent.appendChild(node);
-    return node;
+  // Shows all maps, or that of one agent.
+  layOut(which) {
+    at("layout").value = which;
+    this.maps.forEach((map, k) => { map.figure.hidden = which !== "all" && +which !== k; map.figure.style.display = map.figure.hidden ? "none" : ""; });
+    if (which !== "all") this.choose(+which);
+    this.arrange();
   }
 
-  titled(tag, parent, attributes) {
-    const node = this.svg(tag, parent, attributes);
-    node.label = this.svg("title", node);
-    return node;
+  // Maps beside or below each other, whichever shows them larger.
+  arrange() {
+    const place = at("maps"), shown = this.maps.filter(map => !map.figure.hidden).length, { width, height } = this.view.whole;
+    const sizeIn = columns => Math.min(place.clientWidth / columns / width, (place.clientHeight / Math.ceil(shown / columns) - 30) / height);
+    let best = 1;
+    for (let columns = 2; columns <= shown; columns++) if (sizeIn(columns) > sizeIn(best)) best = columns;
+    place.style.gridTemplateColumns = `repeat(${best}, minmax(0, 1fr))`;
   }
 
-  build() {
-    const { grid } = this.episode, map = this.at("map");
-    const [x, y] = [0, 1].map(axis => grid.centres.map(centre => centre[axis]));
-    const [left, right, low, high] = [Math.min(...x) - 0.9, Math.max(...x) + 0.9, Math.min(...y) - 0.9, Math.max(...y) + 0.9];
-    map.setAttribute("viewBox", `${left} ${-high} ${right - left} ${high - low}`);
-    this.lines = grid.lines.map(() => this.titled("polyline", map, { class: "line" }));
-    this.stubs = grid.symbols.map(() => this.svg("polyline", map, { class: "stub" }));
-    this.bars = this.svg("path", map, { class: "bar" });
-    this.discs = grid.centres.map(([cx, cy]) => this.svg("circle", map, { class: "disc", cx, cy: -cy, r: 0.21 }));
-    this.symbols = grid.symbols.map(([, kind]) => this.titled("path", map, { class: kind }));
-    grid.centres.forEach(([cx, cy], sub) => {
-      this.svg("text", map, { x: cx, y: -cy + 0.075, "font-size": sub > 99 ? 0.16 : 0.22 }).textContent = sub;
-    });
-    this.entries = this.episode.decisions.map(([step, words]) => {
-      if (!words) return null;
-      const entry = document.createElement("button");
-      entry.innerHTML = "<small></small> <span></span>";
-      entry.firstChild.textContent = `step ${step + 1}, ${this.episode.time(step + 1)}`;
-      entry.lastChild.textContent = words;
-      entry.addEventListener("click", () => { this.pause(); this.show(Math.min(step + 1, this.episode.steps - 1)); });
-      this.at("decisions").appendChild(entry);
+  // The agent of whom the panel tells.
+  choose(k) {
+    const changed = this.told !== k;
+    this.chosen = this.told = k;
+    this.maps.forEach((map, j) => map.figure.classList.toggle("chosen", j === k && this.maps.length > 1 || this.maps.length === 1));
+    this.tabs.forEach((tab, j) => tab.setAttribute("aria-pressed", j === k));
+    if (!changed) return;
+    this.makeLog();
+    this.repaint();
+    this.show(this.step);
+  }
+
+  makeLog() {
+    at("log").replaceChildren();
+    this.entries = this.episode.log().map(([step, kind, words]) => {
+      const entry = made("button", at("log"), { className: kind });
+      made("small", entry, {}, `step ${step}, ${this.episode.time(step)} · ${kind.replace("agent end", "end")}`);
+      entry.append(document.createElement("br"), words);
+      entry.addEventListener("click", () => { this.pause(); this.show(step, kind === "trip" ? 0 : Infinity); });
       return entry;
     });
   }
 
-  show(step) {
-    const { episode } = this, { grid } = episode;
-    episode.seek(step);
-    const split = episode.splitSubstations(), colours = episode.colours[this.dark.matches ? "dark" : "light"];
-    const points = list => list.map(([x, y]) => `${x.toFixed(3)},${(-y).toFixed(3)}`).join(" ");
-    this.lines.forEach((node, line) => {
-      const on = episode.isOn(line), loading = episode.loading(line);
-      const why = episode.within(episode.attacked, line) ? "attacked" : episode.within(episode.maintained, line) ? "maintenance" : "out";
-      node.setAttribute("points", points(episode.lineCourse(line, split)));
-      node.setAttribute("class", on ? "line" : `line off ${why}`);
-      node.style.stroke = on ? colours[Math.min(loading, colours.length - 1)] : "";
-      node.style.strokeWidth = 0.045 * (0.9 + 0.9 * Math.min(loading / 100, 1));
-      node.label.textContent = `line ${line} (${grid.lineNames[line]}): ${on ? loading + "%" : why}`;
-    });
-    this.symbols.forEach((node, symbol) => {
-      const [element, kind, x, y, name] = grid.symbols[symbol], share = episode.power[step * episode.nSymbol + symbol] / 255;
-      const r = 0.12 * (0.5 + 1.1 * share), [end, before] = episode.end(element, split);
-      this.stubs[symbol].setAttribute("points", points([end, before, [x, y]]));
-      node.setAttribute("d", outline(kind, x, -y, r));
-      node.label.textContent = `${kind} ${name}: ${episode.megawatts(symbol).toFixed(0)} MW`;
-    });
-    this.discs.forEach((node, sub) => { node.style.display = split.has(sub) ? "none" : ""; });
-    this.bars.setAttribute("d", [...split].map(sub => {
-      const [x, y] = grid.centres[sub];
-      return `M${x - 0.3} ${-y - 0.19}h.6M${x - 0.3} ${-y + 0.19}h.6`;
-    }).join(""));
-    this.tell(step);
-    this.drawStrip(step);
-  }
-
-  tell(step) {
-    const { episode } = this, worst = episode.worst(step), ended = step === episode.steps - 1;
+  show(step, round = Infinity) {
+    this.step = step;
+    this.round = round;
+    for (const episode of this.episodes) episode.seek(step, round);
     this.slider.value = step;
-    this.at("clock").textContent = episode.time(step);
-    this.at("step").textContent = `${step} of ${episode.length}`;
-    this.at("worst").textContent = `${episode.loading(worst)}% on line ${worst}`;
-    const latest = episode.decisionBefore(step);
-    this.at("action").textContent = latest < 0 ? "nothing so far" : `${episode.decisions[latest][1]} (step ${episode.decisions[latest][0] + 1})`;
-    this.at("ending").textContent = ended ? episode.ending : "";
-    this.entries.forEach((entry, k) => { if (entry) entry.className = k === latest ? "current" : ""; });
-    if (latest >= 0 && this.shown !== latest) {
-      const list = this.at("decisions");
-      list.scrollTop = this.entries[latest].offsetTop - list.offsetTop - list.clientHeight / 2;
-    }
-    this.shown = latest;
+    this.draw();
   }
 
-  drawStrip(step) {
-    const canvas = this.at("strip"), { episode } = this, width = canvas.clientWidth, height = canvas.clientHeight;
-    const colours = episode.colours[this.dark.matches ? "dark" : "light"];
-    if (this.peaks === undefined) {
-      this.peaks = Array.from({ length: episode.steps }, (_, k) => episode.loading(episode.worst(k), k));
+  draw() {
+    for (const map of this.maps) {
+      map.draw(this.dark.matches);
+      this.tellState(map);
     }
-    const ratio = devicePixelRatio || 1, pen = canvas.getContext("2d");
-    canvas.width = width * ratio;
-    canvas.height = height * ratio;
-    pen.scale(ratio, ratio);
-    for (let x = 0; x < width; x++) {
-      const from = Math.floor(x / width * episode.steps), to = Math.max(from + 1, Math.floor((x + 1) / width * episode.steps));
-      let peak = 0;
-      for (let k = from; k < to; k++) peak = Math.max(peak, this.peaks[k]);
-      pen.fillStyle = colours[Math.min(peak, colours.length - 1)];
-      pen.fillRect(x, height - Math.min(peak, 150) / 150 * height, 1, height);
-    }
-    pen.fillStyle = getComputedStyle(document.body).color;
-    pen.fillRect(0, height / 3, width, 1);
-    for (const [at, words] of episode.decisions) if (words) pen.fillRect(at / episode.steps * width, 0, 1.5, 6);
-    pen.fillRect(step / Math.max(1, episode.steps - 1) * width - 1, 0, 2.5, height);
+    for (const chart of this.charts) chart.mark(this.step);
+    this.tellTime();
+    this.tellTotals();
+    this.tellNow();
+    this.tellWhy();
+    this.tellThing();
+    this.markLog();
   }
+
+  tellTime() {
+    const { episode } = this, rounds = episode.step === this.step ? episode.rounds(episode.step) : 1;
+    at("clock").textContent = `${episode.time(this.step)} · step ${this.step} of ${episode.length}`;
+    at("rounds").className = rounds > 1 ? "shown" : "";
+    at("round").textContent = `cascade ${episode.round + 1} of ${rounds}`;
+    at("earlier").disabled = episode.round === 0;
+    at("later").disabled = episode.round === rounds - 1;
+  }
+
+  tellState(map) {
+    const { episode, state } = map, over = this.step > episode.last, worst = episode.worst();
+    const lost = episode.step === episode.steps && !episode.hasFlow;
+    const ended = episode.isLost ? `game over at step ${episode.last}` : `ends at step ${episode.last}`;
+    state.textContent = over || lost ? ended : `worst: ${percentOf(episode.loading(worst))} on line ${worst}`;
+    state.className = lost || (over && episode.isLost) || (!over && episode.loading(worst) > 100) ? "alarm" : "";
+    const bar = this.loadings[this.maps.indexOf(map)].label.lastChild;
+    bar.textContent = over || lost ? ended : `worst loading ${percentOf(episode.loading(worst))}`;
+  }
+
+  tellTotals() {
+    const { episode } = this, { totals } = episode, mega = name => `${episode.total(name).toFixed(0)} MW`;
+    this.fillLabel(this.mix.label, `demand ${mega("demand")}`, " (line)", totals.kinds.map(kind => [kind, episode.total(kind).toFixed(0)]));
+    const weather = totals.weather.map((kind, k) => {
+      const share = Math.round(100 * episode.total(`${kind} available`) / totals.capacity[k]);
+      const cut = episode.total(`${kind} available`) - episode.total(kind);
+      return [kind, `${share}%${cut > 1 ? `, curtailed ${cut.toFixed(0)} MW` : ""}`];
+    });
+    this.fillLabel(this.weather.label, "weather", ", share of capacity", weather);
+  }
+
+  fillLabel(label, name, note, items) {
+    label.replaceChildren();
+    made("b", label, {}, name);
+    label.append(note, document.createElement("br"));
+    for (const [kind, words] of items) {
+      const item = made("span", label);
+      made("i", item).style.background = KIND_COLOURS[kind] ?? OTHER_COLOUR;
+      item.append(`${kind} ${words}`);
+      label.append(" ");
+    }
+  }
+
+  // What happens in this very step.
+  tellNow() {
+    const { episode } = this, place = at("now"), here = episode.step === this.step;
+    place.replaceChildren();
+    if (!here) { made("p", place, {}, `${episode.label}: ${episode.ending}`); return; }
+    const isLastRound = episode.round === episode.rounds(this.step) - 1;
+    const events = episode.log().filter(([step, kind]) => step === this.step && kind !== "trip" && (isLastRound || kind !== "end"));
+    for (const [, kind, words] of events) made("p", place, {}, `${kind === "heuristic" ? "The heuristic: " : kind === "agent" ? "The agent: " : ""}${words}`);
+    const rounds = episode.cascadeAt.get(this.step);
+    if (rounds) this.tellRound(place, rounds);
+  }
+
+  tellRound(place, rounds) {
+    const { episode } = this, now = rounds[episode.round], before = rounds[episode.round - 1];
+    made("h2", place, {}, `Cascade, ${episode.round + 1} of ${rounds.length}`);
+    for (const trip of before?.trips ?? []) made("p", place, {}, `Before: ${episode.tripInWords(trip)}.`);
+    for (const trip of now.trips) made("p", place, {}, `Now: ${episode.tripInWords(trip)}.`);
+    if (!now.rho) made("p", place, {}, "No power flow is left. Production and demand are those of the step before.");
+    else if (!now.trips.length) made("p", place, {}, "Nothing more trips.");
+  }
+
+  tellWhy() {
+    const { episode } = this, place = at("why"), number = episode.reasonBefore(episode.step + (episode.step < episode.steps ? 1 : 0));
+    if (this.whyTold === `${this.chosen} ${number} ${episode.step}`) return;
+    this.whyTold = `${this.chosen} ${number} ${episode.step}`;
+    place.replaceChildren();
+    if (number < 0) {
+      made("p", place, { className: "note" }, "The agent was not asked yet, or the grid was safe whenever it was.");
+      return;
+    }
+    this.explain(place, episode.reasons[number]);
+  }
+
+  explain(place, reason) {
+    const { episode } = this, ago = episode.step - reason.step;
+    const when = ago === 0 ? "decides now" : ago === 1 ? "has just decided" : `decided ${ago} steps ago`;
+    const chosen = reason.alternatives.find(alternative => alternative[3]);
+    made("h2", place, {}, `Why: the agent ${when} (step ${reason.step})`);
+    const before = episode.worstAt(reason.step);
+    const loading = episode.loadingAt(before, reason.step);
+    made("p", place, {}, `Before: ${percentOf(loading)} on line ${before}${loading < ALARM ? ": the grid is safe" : ""}.`);
+    made("p", place, {}, `It ${chosen && episode.words[chosen[0]] ? `plays: ${episode.words[chosen[0]]}.` : "does nothing."}`);
+    made("p", place, {}, this.outcome(reason));
+    this.tabulate(place, reason);
+    const preference = reason.preference && !this.saysLoading(reason) ? ` ${reason.preference}: what the agent says.` : "";
+    made("p", place, { className: "note" }, `Forecast: worst loading of the next step before protections act, of the best of ${reason.tried} actions, of doing nothing and of what was played.${preference}`);
+  }
+
+  // What the decision led to.
+  outcome(reason) {
+    const { episode } = this, next = reason.step + 1;
+    if (next >= episode.steps) return episode.isLost ? "After: the game is over." : "After: the recording ends.";
+    const after = episode.worstAt(next);
+    return `After: ${episode.loadingAt(after, next)}% on line ${after}.`;
+  }
+
+  saysLoading(reason) { return reason.preference === "worst loading"; }
+
+  tabulate(place, reason) {
+    const table = made("table", place), head = made("tr", made("thead", table)), body = made("tbody", table);
+    const own = reason.preference && !this.saysLoading(reason);
+    for (const heading of ["alternative", "forecast", ...(own ? [reason.preference] : [])]) made("th", head, {}, heading);
+    for (const [words, promised, preference, chosen] of reason.alternatives) {
+      const row = made("tr", body, { className: chosen ? "chosen" : "" });
+      made("td", row, {}, `${chosen ? "✓ " : ""}${this.episode.words[words] || "do nothing"}`);
+      made("td", row, {}, promised === null ? "–" : promised === "lost" ? "lost" : `${Math.round(promised)}%`);
+      if (own) made("td", row, {}, preference === null ? "–" : String(preference));
+    }
+  }
+
+  select(thing, bringIntoView = false) {
+    this.thing = thing;
+    for (const map of this.maps) map.highlight(thing);
+    for (const chart of this.loadings) chart.repaint();
+    if (thing && bringIntoView) { const [x, y] = placeOf(this.grid, thing); this.view.show(x, -y); }
+    this.tellThing();
+  }
+
+  tellThing() {
+    const place = at("found"), { thing, episode } = this;
+    place.replaceChildren();
+    if (!thing) return;
+    made("h2", place, {}, `${thing.kind} ${thing.number} (${thing.name ?? this.nameOf(thing)})`);
+    made("p", place, {}, this.stateOf(thing, episode));
+  }
+
+  nameOf({ kind, number }) { return (kind === "line" ? this.grid.lineNames : this.grid.subNames)[number]; }
+
+  stateOf({ kind, number }, episode) {
+    const { grid } = this;
+    if (kind === "line") {
+      const [origin, extremity] = grid.lines[number], [from, to] = episode.runsForward(number) ? [origin, extremity] : [extremity, origin];
+      if (!episode.isOn(number)) return `Between substations ${origin} and ${extremity}; ${episode.outage(number)}. Its loading is the line in the chart below.`;
+      return `From substation ${from} to ${to}: ${episode.loading(number)}%. Its loading is the line in the chart below.`;
+    }
+    if (kind !== "substation") {
+      const symbol = grid.symbols.findIndex(each => each.kind === kind && each.number === number), { element, detail } = grid.symbols[symbol];
+      return `${detail} at substation ${grid.elementSub[element]}, busbar ${episode.topology[element]}: ${episode.megawatts(symbol).toFixed(0)} MW.`.trim();
+    }
+    const on = busbar => grid.elementSub.filter((sub, element) => sub === number && episode.topology[element] === busbar).length;
+    return on(2) ? `Split: ${on(1)} elements on busbar 1, ${on(2)} on busbar 2.` : `${on(1)} elements, all on busbar 1.`;
+  }
+
+  // The entry of the log that this moment belongs to is in view.
+  markLog() {
+    const story = this.episode.log();
+    let current = -1;
+    while (current + 1 < story.length && story[current + 1][0] <= this.step) current++;
+    if (current === this.marked && this.markedOf === this.chosen) return;
+    this.entries[this.marked]?.classList.remove("current");
+    this.entries[current]?.classList.add("current");
+    [this.marked, this.markedOf] = [current, this.chosen];
+  }
+
+  toggleFlows() {
+    const shown = at("flows").getAttribute("aria-pressed") !== "true";
+    at("flows").setAttribute("aria-pressed", shown);
+    for (const layer of document.querySelectorAll(".flows")) layer.classList.toggle("hidden", !shown);
+  }
+
+  // One step, or within a cascade one round, of the agent who is looked at.
+  forwards(by) {
+    const { episode } = this, rounds = episode.rounds(episode.step);
+    if (by === 1 && this.step === episode.step && episode.round < rounds - 1) return this.show(this.step, episode.round + 1);
+    const step = Math.min(this.last, this.step + by);
+    if (step === this.step) return;
+    this.show(step, this.cascadeBetween(step) ? 0 : Infinity);
+  }
+
+  backwards(by) {
+    if (by === 1 && this.step === this.episode.step && this.episode.round > 0) return this.show(this.step, this.episode.round - 1);
+    this.show(Math.max(0, this.step - by));
+  }
+
+  cascadeBetween(step) { return this.episodes.some(episode => episode.rounds(step) > 1 && step <= episode.last); }
 
   key(event) {
-    const move = { ArrowLeft: -1, ArrowRight: 1, PageUp: -12, PageDown: 12 }[event.key] * (event.shiftKey ? 12 : 1);
-    if (event.key === " ") { event.preventDefault(); this.timer ? this.pause() : this.play(); }
-    if (Number.isNaN(move)) return;
+    if (event.target.matches("input:not([type=range]), select") || event.ctrlKey || event.metaKey || event.altKey) return;
+    const by = event.shiftKey ? 12 : 1;
+    const does = {
+      " ": () => this.timer ? this.pause() : this.play(),
+      ArrowRight: () => { this.pause(); this.forwards(by); },
+      ArrowLeft: () => { this.pause(); this.backwards(by); },
+      PageDown: () => { this.pause(); this.forwards(12); },
+      PageUp: () => { this.pause(); this.backwards(12); },
+      Home: () => { this.pause(); this.show(0); },
+      End: () => { this.pause(); this.show(this.last); },
+      "+": () => this.view.zoom(1.5),
+      "-": () => this.view.zoom(1 / 1.5),
+      0: () => this.view.fit(),
+      f: () => this.toggleFlows(),
+      "/": () => at("search").focus(),
+    }[event.key];
+    if (!does) return;
     event.preventDefault();
-    this.pause();
-    this.show(Math.max(0, Math.min(this.episode.steps - 1, this.episode.step + move)));
+    does();
   }
 
   play() {
-    if (this.episode.step === this.episode.steps - 1) this.show(0);
-    this.at("play").textContent = "Pause";
+    if (this.step === this.last) this.show(0);
+    at("play").textContent = "Pause";
     this.timer = setInterval(() => {
-      const step = Math.min(this.episode.step + +this.at("speed").value, this.episode.steps - 1);
-      this.show(step);
-      if (step === this.episode.steps - 1) this.pause();
+      this.forwards(+at("speed").value);
+      if (this.step === this.last && this.episode.round === this.episode.rounds(this.episode.step) - 1) this.pause();
     }, 80);
   }
 
   pause() {
     clearInterval(this.timer);
     this.timer = 0;
-    this.at("play").textContent = "Play";
+    at("play").textContent = "Play";
   }
 }
 
-function outline(kind, x, y, r) {
-  if (kind === "load") return `M${x - r} ${y - 0.75 * r}h${2 * r}L${x} ${y + r}Z`;
-  if (kind === "storage") return `M${x - 0.85 * r} ${y - 0.85 * r}h${1.7 * r}v${1.7 * r}h${-1.7 * r}Z`;
-  const wave = `M${x - 0.6 * r} ${y}q${0.3 * r} ${-0.7 * r} ${0.6 * r} 0t${0.6 * r} 0`;
-  return `M${x - r} ${y}a${r} ${r} 0 1 0 ${2 * r} 0a${r} ${r} 0 1 0 ${-2 * r} 0Z${wave}`;
-}
-
-if (typeof document === "undefined") module.exports = { Episode, outline };
-else new Page(new Episode(JSON.parse(document.getElementById("episode").textContent)));
+const data = JSON.parse(at("episode").textContent);
+loadEpisodes(data).then(episodes => { window.page = new Page(episodes, data); });

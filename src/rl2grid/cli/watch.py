@@ -21,6 +21,8 @@ from rl2grid.scenarios.splits import SPLITS
 if TYPE_CHECKING:
     from rich.progress import Progress
 
+    from rl2grid.records.recordings import Recording
+
 FRAMES = 300
 """Frames of an animation unless --every is given: 25 seconds."""
 FORMATS = ("html", "gif", "mp4")
@@ -30,6 +32,9 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add the flags of the command."""
     parser.add_argument("agent", help=AGENT_HELP)
     parser.add_argument("task", help="for example bus14-T0")
+    parser.add_argument(
+        "--against", nargs="+", default=[], metavar="AGENT", help="others who play the same month, on the same page"
+    )
     parser.add_argument("--split", default="validation", choices=SPLITS)
     parser.add_argument("--scenario", default=None, help="by default the first of the split")
     parser.add_argument("--seed", type=int, default=0, help="of maintenance, opponent and agent")
@@ -48,50 +53,84 @@ def _run(options: argparse.Namespace, output: Output) -> int:
     if options.every is not None and options.every < 1:
         raise UsageError(f"every={options.every} is not allowed: give a number of grid steps, at least 1.")
     animation, watch_page = _drawing_modules()
+    _check_agents(task, options)
     for suffix in options.format:
         animation.check_encoder(suffix)
     make_folder(options.output)
     try:
         with _progress(output) as progress:
-            recording = _play(task, options, progress)
-            name = f"{task.id.removeprefix('rl2grid/')}-{recording.agent}-{recording.scenario.replace('/', '-')}"
-            path = options.output / f"{name}-{options.seed}"
-            there = [suffix for suffix in options.format if path.with_name(f"{path.name}.{suffix}").exists()]
-            for suffix in options.format:
-                target = path.with_name(f"{path.name}.{suffix}")
-                if suffix == "html":
-                    watch_page.write_watch_page(target, task.grid, recording)
+            recordings = [_play(agent, task, options, progress) for agent in (options.agent, *options.against)]
+            files = _files(task, recordings, options)
+            there = {file for file in files if file.exists()}
+            for file, shown in files.items():
+                if file.suffix == ".html":
+                    watch_page.write_watch_page(file, task.grid, shown)
                     continue
-                steps = _frame_steps(len(recording.rho), options.every)
-                pictures = animation.frames(task.grid, recording, steps)
-                animation.write_animation(target, progress.track(pictures, len(steps), description=f"Drawing {suffix}"))
+                steps = _frame_steps(len(shown[0].rho), options.every)
+                pictures = animation.frames(task.grid, shown[0], steps)
+                drawing = f"Drawing {file.suffix[1:]}"
+                animation.write_animation(file, progress.track(pictures, len(steps), description=drawing))
     except KeyboardInterrupt:
         print("rl2grid: interrupted; no file was left half written.", file=sys.stderr)
         return INTERRUPTED
-    acted = sum(bool(words) for words in recording.actions)
-    ending = f"game over: {recording.game_over}" if recording.game_over else "alive at the end"
-    output.text(f"{recording.n_steps:,} of {recording.episode_length:,} steps, {acted:,} actions; {ending}.")
-    files = [f"{path}.{suffix}" for suffix in options.format]
-    for suffix, file in zip(options.format, files, strict=True):
-        output.remark(f"{'Replaced' if suffix in there else 'Written'}: {file}")
-    output.results(
-        steps=recording.n_steps,
-        episode_length=recording.episode_length,
-        actions=acted,
-        game_over=recording.game_over or None,
-        files=files,
-    )
+    _tell(output, recordings, watch_page.labels_of(recordings))
+    for file in files:
+        output.remark(f"{'Replaced' if file in there else 'Written'}: {file}")
+    results = [_result(recording) for recording in recordings]
+    others = {"against": results[1:]} if len(results) > 1 else {}
+    output.results(**results[0], **others, files=[str(file) for file in files])
     return 0
 
 
-def _play(task: Task, options: argparse.Namespace, progress: Progress) -> Any:
+def _check_agents(task: Task, options: argparse.Namespace) -> None:
+    """Refuse agents that are not to be had, before the first of several has played."""
+    from rl2grid.evaluation.agents import make_agent
+
+    for agent in options.against:
+        make_agent(agent, task)
+
+
+def _files(task: Task, recordings: Sequence[Recording], options: argparse.Namespace) -> dict[Path, list[Recording]]:
+    """What is to be written, and of whom: one page of all agents, and an animation of each."""
+    begin, first = task.id.removeprefix("rl2grid/"), recordings[0]
+    end = f"{first.scenario.replace('/', '-')}-{options.seed}"
+    agents = [f"{k + 1}-{each.agent}" if len(recordings) > 1 else each.agent for k, each in enumerate(recordings)]
+    files: dict[Path, list[Recording]] = {}
+    for suffix in options.format:
+        if suffix == "html":
+            together = "-against-".join(each.agent for each in recordings)
+            files[options.output / f"{begin}-{together}-{end}.html"] = list(recordings)
+            continue
+        for agent, recording in zip(agents, recordings, strict=True):
+            files[options.output / f"{begin}-{agent}-{end}.{suffix}"] = [recording]
+    return files
+
+
+def _tell(output: Output, recordings: Sequence[Recording], labels: Sequence[str]) -> None:
+    for recording, label in zip(recordings, labels, strict=True):
+        acted = sum(bool(words) for words in recording.actions)
+        ending = f"game over: {recording.game_over}" if recording.game_over else "alive at the end"
+        who = f"{label}: " if len(recordings) > 1 else ""
+        output.text(f"{who}{recording.n_steps:,} of {recording.episode_length:,} steps, {acted:,} actions; {ending}.")
+
+
+def _result(recording: Recording) -> dict[str, Any]:
+    return {
+        "steps": recording.n_steps,
+        "episode_length": recording.episode_length,
+        "actions": sum(bool(words) for words in recording.actions),
+        "game_over": recording.game_over or None,
+    }
+
+
+def _play(agent: str, task: Task, options: argparse.Namespace, progress: Progress) -> Recording:
     from rl2grid.evaluation.protocol import AS_TRAINED
     from rl2grid.evaluation.watching import play_to_watch
 
     playing = progress.add_task("Playing", total=None)
     heuristic = {None: AS_TRAINED, "None": None}.get(options.heuristic, options.heuristic)
     return play_to_watch(
-        options.agent,
+        agent,
         task,
         split=options.split,
         scenario=options.scenario,
