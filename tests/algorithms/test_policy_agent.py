@@ -161,3 +161,24 @@ def test_other_observations_and_actions_are_refused():
     env.action_space.n = np.int64(7)  # type: ignore[attr-defined]
     with pytest.raises(UsageError, match="chooses among 3 actions"):
         agent.bind(env)
+
+
+def test_a_policy_tells_its_best_actions():
+    agent = PolicyAgent(contents(trained()))
+    agent.bind(env := SingleToyGrid(TASKS[False]))
+    observation, info = env.reset()
+    action = agent.act(observation, info)
+    considered = agent.explain()
+    assert considered is not None
+    assert considered.meaning == "probability"
+    assert considered.actions[0] == action
+    values = list(considered.values)
+    assert values == sorted(values, reverse=True)
+    assert sum(values) <= 1.0 + 1e-6
+
+
+def test_a_continuous_policy_has_no_best_actions():
+    agent = PolicyAgent(contents(trained(True)))
+    agent.bind(env := SingleToyGrid(TASKS[True]))
+    agent.act(*env.reset())
+    assert agent.explain() is None

@@ -135,7 +135,7 @@ def test_names_neither_break_the_page_nor_enter_it(tmp_path):
     episode = replace(made_up(BUS14, 20), agent="{data}<!--<script>", actions=("{script}", "<!--<script>"))
     write_watch_page(tmp_path / "page.html", BUS14, [episode])
     page = (tmp_path / "page.html").read_text()
-    assert "seed 0: {data}&lt;!--&lt;script&gt; + idle</h1>" in page
+    assert "seed 0: {data}&lt;!--&lt;script&gt; + idle</title>" in page
     assert "<!--" not in page
     assert page.count("<script") == page.count("</script>") == 2
     data = embedded_data(page)
@@ -177,13 +177,14 @@ def test_reasons_and_endings_are_told():
     lost = np.zeros(BUS14.dim_topo, np.bool_)
     lost[BUS14.load_pos_topo_vect[9]] = True
     ending = Ending(np.ones(BUS14.dim_topo, np.int8), lost, np.zeros(BUS14.n_line, np.bool_))
-    recording = replace(made_up(BUS14, 20), reasons=(Reason(4, "probability", 50, choices),), ending=ending)
+    recording = replace(made_up(BUS14, 20), reasons=(Reason(4, "probability", "the best", 50, choices),), ending=ending)
     data = page_data(BUS14, [recording])
     (episode,) = data["episodes"]
     assert episode["ending"].endswith("a load was cut off from the grid. Cut off: load 9 (load_12_9).")
     (reason,) = episode["reasons"]
     told = [[data["words"][k], *rest] for k, *rest in reason["alternatives"]]
     assert told == [["open line 3", 87.6, 0.25, 1], ["", "lost", None, 0]]
+    assert data["words"][reason["why"]] == "the best"
     # Nothing is known of the rounds: the last frame shows what was left.
     (cascade,) = episode["cascades"]
     assert cascade["step"] == 21

@@ -98,6 +98,7 @@ def test_reasons_hold_what_greedy_compared():
         assert recorded.rho[reason.step].max() >= SAFE_RHO
     acted = [reason for reason in recorded.reasons if any(each.chosen and each.action for each in reason.alternatives)]
     assert acted
+    assert all("best of those" in reason.why or "least worst loading" in reason.why for reason in acted)
     for reason in acted:
         by_action = {each.action: each.promised for each in reason.alternatives}
         assert min(by_action.values()) < by_action[""]

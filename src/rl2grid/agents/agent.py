@@ -65,6 +65,8 @@ class Considered(NamedTuple):
     """Best first; a few are enough."""
     values: Sequence[float]
     """Of each of them."""
+    why: str = ""
+    """By what rule it chose among them, in words."""
 
 
 @runtime_checkable

@@ -45,7 +45,7 @@ class Greedy:
         return self._search.act(observation, info)
 
     def explain(self) -> Considered | None:
-        """What was tried, on redispatching tasks; on topology tasks that is what every action promises."""
+        """What was tried and by what rule the action was chosen."""
         return self._search.explain() if isinstance(self._search, ExplainingAgent) else None
 
     def _search_of(self, space: gymnasium.Space[Any]) -> Agent:

@@ -65,7 +65,7 @@ class GreedyDispatch(DispatchAgent):
     def act(self, observation: Observation, info: Info) -> Action:
         """The action with the least worst loading on the forecast; zeros where none is better."""
         state: GridState = self._env.state
-        self._remember([], np.zeros(0))
+        self._remember([], np.zeros(0), "")
         if not is_safe(state, 0):
             return self._relieve(state)
         return self._give_back(state) if anything_dispatched(state) else self._nothing.copy()
@@ -75,20 +75,23 @@ class GreedyDispatch(DispatchAgent):
         if not self._tried:
             return None
         order = np.argsort(self._promised, kind="stable")
-        return Considered("worst loading", [self._tried[k] for k in order], self._promised[order].tolist())
+        return Considered("worst loading", [self._tried[k] for k in order], self._promised[order].tolist(), self._why)
 
-    def _remember(self, tried: list[Action], promised: F64) -> None:
-        self._tried, self._promised = tried, promised
+    def _remember(self, tried: list[Action], promised: F64, why: str) -> None:
+        self._tried, self._promised, self._why = tried, promised, why
 
     def _relieve(self, state: GridState) -> Action:
         control = controls(state, self._grid)
         plans = [control.now, *self._plans(state, control)]
         actions = [self._nothing.copy(), *(encode(state, self._grid, plan) for plan in plans)]
         loadings = np.array([worst_loading(self._env, action) for action in actions])
-        self._remember(actions, loadings)
         prices = np.array([0.0, *(float(control.price @ np.abs(plan - control.at_rest)) for plan in plans)])
         enough = (loadings < _ENOUGH) & (loadings < loadings[0] - _WORTHWHILE)
         best = int(np.where(enough, prices, np.inf).argmin() if enough.any() else loadings.argmin())
+        rule = (
+            f"the cheapest of those that keep every line below {_ENOUGH:.0%}" if enough.any() else "the least loading"
+        )
+        self._remember(actions, loadings, rule)
         return actions[best] if loadings[best] < loadings[0] - _WORTHWHILE else actions[0]
 
     def _give_back(self, state: GridState) -> Action:
@@ -104,7 +107,7 @@ class GreedyDispatch(DispatchAgent):
             loadings.append(worst_loading(self._env, actions[-1]))
             if loadings[-1] < _CALM:
                 break
-        self._remember(actions, np.array(loadings))
+        self._remember(actions, np.array(loadings), "as much dispatch is given back as the forecast allows")
         return actions[int(np.argmin(loadings))]
 
     def _can_be_followed(self, state: GridState, change: F64) -> bool:

@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from rl2grid.agents.agent import Action, Info, Observation
+from rl2grid.agents.agent import Action, Considered, Info, Observation
 from rl2grid.agents.recovery import Recovery
 from rl2grid.arrays import F64, Flags
 from rl2grid.errors import UsageError
@@ -69,20 +69,31 @@ class GreedyTopology:
     def act(self, observation: Observation, info: Info) -> Action:
         """The id of the best action; 0 where none is better than doing nothing."""
         if is_safe(self._env.state, 0):
+            self._why = "while the grid is safe, it does what recovery does, if the forecast then stays safe"
             return self._recover(observation, info)
         outcomes = self._env.what_if(self._ids)
         loading = np.where(outcomes.legal, outcomes.worst_loading, np.inf).astype(np.float64)
         if not loading.min() < loading[_NOTHING] - _WORTHWHILE:
+            self._why = "by the forecast, no action is better than doing nothing"
             return _NOTHING
         return int(self._ids[self._best(loading)])
+
+    def explain(self) -> Considered | None:
+        """By what rule the last action was chosen; what was compared is what every action promises."""
+        return Considered("", (), (), self._why)
 
     def _best(self, loading: F64) -> int:
         """The entry to play, given the worst loading after each: one of them is better than do nothing."""
         effect = effects(self._env.grid, self._env.state, self._catalogue)
         safe = loading < min(float(SAFE_RHO), float(loading[_NOTHING]) - _WORTHWHILE)
-        for preferred in (safe & effect.restores, safe & effect.can_be_undone):
+        rules = (
+            (safe & effect.restores, "the best of those that make the grid safe and restore a line or a substation"),
+            (safe & effect.can_be_undone, "the best of those that make the grid safe and that one action can undo"),
+        )
+        for preferred, self._why in rules:
             if preferred.any():
                 return int(np.where(preferred, loading, np.inf).argmin())
+        self._why = "the least worst loading: no action that can be undone makes the grid safe"
         return int(loading.argmin())
 
     def _recover(self, observation: Observation, info: Info) -> Action:
@@ -108,6 +119,7 @@ class GreedyN1(GreedyTopology):
         candidates = ranked[loading[ranked] < acceptable]
         undoable = effects(self._env.grid, self._env.state, self._catalogue.take(candidates)).can_be_undone
         candidates = candidates[undoable] if undoable.any() else candidates
+        self._why = "of the best, the one after which the loss of any one line does least"
         danger = np.array([insecurity(self._env.security(self._ids[entry])) for entry in candidates.tolist()])
         return int(candidates[np.lexsort((loading[candidates], danger))[0]])
 

@@ -88,6 +88,7 @@ class GridMap {
     this.haloDisc = svgNode("circle", this.svg, { class: "halo disc", r: 0 });
     const layers = ["lines", "stubs", "flows", "bars", "discs", "symbols", "numbers", "crosses", "names"];
     const [lines, stubs, flows, bars, discs, symbols, numbers, crosses, names] = layers.map(name => this.layer(name));
+    this.beside = parallels(grid.lines);
     this.lines = grid.lines.map((_, line) => this.titled("polyline", lines, { class: "line" }, { kind: "line", number: line }));
     this.stubs = grid.symbols.map(() => svgNode("polyline", stubs, { class: "stub" }));
     this.flows = grid.lines.map(() => svgNode("path", flows, { d: "M-.055 -.06L.075 0L-.055 .06Z" }));
@@ -109,8 +110,9 @@ class GridMap {
     names.replaceChildren();
     if (!kind) return;
     const text = (x, y, words, size) => { svgNode("text", names, { x, y: -y, "font-size": size }).textContent = words; };
-    grid.middles.forEach(([near, far], line) => {
-      text((near[0] + far[0]) / 2, (near[1] + far[1]) / 2 - 0.05, kind === "numbers" ? line : grid.lineNames[line], 0.15);
+    grid.middles.forEach((middle, line) => {
+      const [x, y] = between(middle, this.beside[line] ? 0.7 : 0.3);
+      text(x, y - 0.05, kind === "numbers" ? line : grid.lineNames[line], 0.15);
     });
     grid.symbols.forEach(({ kind: what, number, name, x, y }) => text(x, y - 0.26, kind === "numbers" ? `${what[0]}${number}` : name, 0.12));
     if (kind === "names") grid.centres.forEach(([x, y], sub) => text(x, y + 0.25, grid.subNames[sub], 0.12));
@@ -145,8 +147,9 @@ class GridMap {
     const unknown = on && !episode.hasFlow;
     if (moved) put(node, "points", pointsOf(episode.lineCourse(line, split)));
     put(node, "class", on ? (unknown ? "line unknown" : "line") : `line off ${why}`);
-    const width = 0.045 * (0.9 + 0.9 * Math.min(loading / 100, 1.3));
-    put(node, "style", on && !unknown ? `stroke:${colours[Math.min(loading, colours.length - 1)]};stroke-width:${width.toFixed(3)}` : "stroke-width:.05");
+    const width = 0.045 * (0.9 + 0.9 * Math.min(loading / 100, 1.3)), known = on && !unknown;
+    const colour = known ? `stroke:${colours[Math.min(loading, colours.length - 1)]};` : "";
+    put(node, "style", `${colour}stroke-width:calc(${(known ? width : 0.05).toFixed(3)}px * var(--thick))`);
     const state = on ? (unknown ? "no power flow" : `${loading}%`) : why;
     node.label.textContent = `${episode.lineName(line)}: ${state}`;
     this.drawFlow(line, on && !unknown && loading > 1);
@@ -157,7 +160,7 @@ class GridMap {
     put(node, "visibility", flows ? "visible" : "hidden");
     if (!flows) return;
     const [near, far] = episode.grid.middles[line], [from, to] = this.directionOf(line, near, far);
-    const [x, y] = [(near[0] + far[0]) / 2, (near[1] + far[1]) / 2];
+    const [x, y] = between([near, far], 0.5);
     const angle = Math.atan2(-(to[1] - from[1]), to[0] - from[0]) * 180 / Math.PI;
     put(node, "transform", `translate(${x.toFixed(3)} ${(-y).toFixed(3)}) rotate(${angle.toFixed(1)})`);
   }
@@ -196,6 +199,9 @@ class GridMap {
   frame() {
     const { x, y, width, height } = this.view.box;
     this.svg.setAttribute("viewBox", `${x} ${y} ${width} ${height}`);
+    // On a small picture of a large grid, lines are drawn thicker than to scale.
+    const thick = Math.max(1, Math.min(2.2, 30 * width / Math.max(1, this.svg.clientWidth)));
+    this.svg.style.setProperty("--thick", thick.toFixed(2));
     // Where all is in view, a finger scrolls the page; else it moves the map.
     this.svg.style.touchAction = this.view.isWhole ? "pan-y" : "none";
   }
@@ -240,10 +246,23 @@ class GridMap {
 
 function pointsOf(course) { return course.map(([x, y]) => `${x.toFixed(3)},${(-y).toFixed(3)}`).join(" "); }
 
+// A point of the way from one to another.
+function between([[x, y], [z, w]], share) { return [x + share * (z - x), y + share * (w - y)]; }
+
+// For each line whether it is the second, fourth ... between its substations.
+function parallels(lines) {
+  const count = {};
+  return lines.map(([one, other]) => {
+    const pair = [one, other].sort((a, b) => a - b).join();
+    count[pair] = (count[pair] ?? 0) + 1;
+    return count[pair] % 2 === 0;
+  });
+}
+
 // Where a line, substation, generator, load or storage unit is drawn.
 function placeOf(grid, { kind, number }) {
   if (kind === "substation") return grid.centres[number];
-  if (kind === "line") return [0, 1].map(axis => (grid.middles[number][0][axis] + grid.middles[number][1][axis]) / 2);
+  if (kind === "line") return between(grid.middles[number], 0.5);
   const symbol = grid.symbols.find(each => each.kind === kind && each.number === number);
   return [symbol.x, symbol.y];
 }

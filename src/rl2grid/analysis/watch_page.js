@@ -126,6 +126,7 @@ class Page {
     let best = 1;
     for (let columns = 2; columns <= shown; columns++) if (sizeIn(columns) > sizeIn(best)) best = columns;
     place.style.gridTemplateColumns = `repeat(${best}, minmax(0, 1fr))`;
+    for (const map of this.maps) map.frame();
   }
 
   // The agent of whom the panel tells.
@@ -257,6 +258,8 @@ class Page {
     const loading = episode.loadingAt(before, reason.step);
     made("p", place, {}, `Before: ${percentOf(loading)} on line ${before}${loading < ALARM ? ": the grid is safe" : ""}.`);
     made("p", place, {}, `It ${chosen && episode.words[chosen[0]] ? `plays: ${episode.words[chosen[0]]}.` : "does nothing."}`);
+    const rule = episode.words[reason.why];
+    if (rule) made("p", place, {}, `Its rule: ${rule}.`);
     made("p", place, {}, this.outcome(reason));
     this.tabulate(place, reason);
     const preference = reason.preference && !this.saysLoading(reason) ? ` ${reason.preference}: what the agent says.` : "";

@@ -45,11 +45,13 @@ def write_watch_page(path: Path, grid: Grid, recordings: Sequence[Recording]) ->
     """
     first, labels = recordings[0], labels_of(recordings)
     task = first.task.removeprefix("rl2grid/")
-    title = f"{task}, {first.scenario}, seed {first.seed}: {' against '.join(labels)}"
+    heading = f"{task}, {first.scenario}, seed {first.seed}"
+    title = f"{heading}: {' against '.join(labels)}"
     script = "\n".join(_resource(name) for name in _SCRIPTS)
     body = filled(
         _resource("watch_page.html"),
         title=html.escape(printable(title)),
+        heading=html.escape(printable(heading)),
         legend=_legend(grid),
         data=embedded(page_data(grid, recordings)),
         script=script,
@@ -185,6 +187,7 @@ def _reason_data(reason: Reason, words: _Words) -> dict[str, Any]:
     return {
         "step": reason.step,
         "preference": reason.preference,
+        "why": words.number(reason.why),
         "tried": reason.tried,
         "alternatives": [
             [words.number(each.action), _rounded(100 * each.promised), _rounded(each.preference), int(each.chosen)]
@@ -293,7 +296,7 @@ def _legend(grid: Grid) -> str:
         "generator": "<circle class=generator cx=14 cy=6 r=5 />",
         "load": "<path class=load d='M9 2h10l-5 9Z' />",
         "storage": "<path class=storage d='M9 1h10v10h-10Z' />",
-        "split substation": "<path class=bar d='M6 3h16M6 9h16' />",
+        "split": "<path class=bar d='M6 3h16M6 9h16' />",
     }
     if not grid.n_storage:
         del shapes["storage"]

@@ -62,7 +62,7 @@ class Reasons:
             )
             for k in ids
         )
-        return Reason(step, considered.meaning if considered else "", len(promised), alternatives)
+        return Reason(step, *_said(considered), len(promised), alternatives)
 
     def _promises(self, ids: list[int]) -> dict[int, float]:
         """Worst loading of the next step after each legal action, where forecasts can be asked for."""
@@ -96,7 +96,7 @@ class Reasons:
         ]
         tried = len(considered.actions) if considered else len(alternatives)
         ranked = tuple(sorted(alternatives, key=lambda each: each.promised))
-        return Reason(step, considered.meaning if considered else "", tried, ranked)
+        return Reason(step, *_said(considered), tried, ranked)
 
     def _simulated(self, plan: Action) -> float:
         base: Any = self._env
@@ -106,6 +106,11 @@ class Reasons:
             return worst_loading(base, plan)
         except UsageError:  # a scenario without forecasts
             return float("nan")
+
+
+def _said(considered: Considered | None) -> tuple[str, str]:
+    """What the agent's numbers are, and its rule."""
+    return (considered.meaning, considered.why) if considered else ("", "")
 
 
 def _by_id(considered: Considered | None) -> dict[int, float]:

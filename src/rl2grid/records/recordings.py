@@ -30,6 +30,8 @@ class Reason:
     """After which the agent was asked."""
     preference: str
     """What the agent's numbers are, for example ``probability``; empty: it gives none."""
+    why: str
+    """By what rule the agent chose, in words; empty: it does not say."""
     tried: int
     """Actions whose promises were compared."""
     alternatives: tuple[Alternative, ...]
