@@ -219,11 +219,11 @@ def test_the_script_says_what_the_recording_says(tmp_path):
         topology: [...episode.topology], worst: episode.worst(), time: episode.time(step),
         on: episode.grid.lines.map((_, line) => episode.isOn(line)), split: [...episode.splitSubstations()],
         out: episode.outage(2), forward: episode.grid.lines.map((_, line) => episode.runsForward(line)),
-        demand: episode.total("demand") }}; }};
-      return {{ steps: [0, 6, 20, 4].map(at), log: episode.log() }};
+        demand: episode.total("demand"), switched: episode.switched() }}; }};
+      return {{ steps: [0, 6, 20, 4, 3, 5].map(at), log: episode.log() }};
     }}"""
     said = run_script("watch_episode.js", program)
-    for step, shown in zip((0, 6, 20, 4), said["steps"], strict=True):
+    for step, shown in zip((0, 6, 20, 4, 3, 5), said["steps"], strict=True):
         assert shown["topology"] == recording.topo_vect[step].tolist()
         assert shown["on"] == recording.line_status[step].tolist()
         assert shown["split"] == ([1] if 5 <= step < 9 else [])
@@ -233,6 +233,9 @@ def test_the_script_says_what_the_recording_says(tmp_path):
         loading = np.where(recording.line_status[step], recording.rho[step], 0)
         assert loading[shown["worst"]] >= loading.max() - 0.01
         assert "01 Apr" in shown["time"]
+    nothing = {"lines": [], "subs": []}
+    switched = [shown["switched"] for shown in said["steps"]]
+    assert switched == [nothing, nothing, nothing, nothing, {"lines": [2], "subs": []}, {"lines": [], "subs": [1]}]
     assert [(step, kind) for step, kind, _ in said["log"]] == [(3, "attack"), (5, "agent"), (20, "agent end")]
 
 

@@ -134,6 +134,36 @@ class Episode {
   // Elements that the end of the episode left without a grid, in its last frame.
   cutOff() { return this.step === this.steps && this.round === this.rounds(this.step) - 1 ? this.lost : []; }
 
+  // What was switched in this step: lines opened or closed, substations with elements that changed their busbar.
+  switched() {
+    const moved = this.changes.find(([step]) => step === this.step)?.[1] ?? [];
+    if (this.inRound || this.step === 0) return { lines: [], subs: [] };
+    const ends = new Map(this.grid.lines.flatMap(([, , origin, extremity], line) => [[origin, line], [extremity, line]]));
+    const before = this.topologyBefore(), lines = new Set(), subs = new Set();
+    for (let k = 0; k < moved.length; k += 2) {
+      const [element, busbar] = [moved[k], moved[k + 1]], isSwitch = busbar < 0 || before[element] < 0;
+      if (ends.has(element) && isSwitch) lines.add(ends.get(element));
+      else subs.add(this.grid.elementSub[element]);
+    }
+    return { lines: [...lines], subs: [...subs] };
+  }
+
+  topologyBefore() {
+    const topology = this.grid.elementSub.map(() => 1);
+    for (const [step, moved] of this.changes) {
+      if (step >= this.step) break;
+      for (let k = 0; k < moved.length; k += 2) topology[moved[k]] = moved[k + 1];
+    }
+    return topology;
+  }
+
+  // Lines whose loading changes most from a step to the next: [line, before, after].
+  changedMost(step, count) {
+    const all = this.grid.lines.map((_, line) => [line, this.loadingAt(line, step), this.loadingAt(line, step + 1)]);
+    const most = all.filter(([, before, after]) => Math.max(before, after) >= 50 && before !== after);
+    return most.sort((a, b) => Math.abs(b[2] - b[1]) - Math.abs(a[2] - a[1])).slice(0, count);
+  }
+
   splitSubstations() {
     const split = new Set();
     this.topology.forEach((busbar, element) => { if (busbar === 2) split.add(this.grid.elementSub[element]); });

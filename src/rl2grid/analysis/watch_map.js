@@ -84,6 +84,7 @@ class GridMap {
 
   build() {
     const { grid } = this.episode;
+    this.switched = svgNode("path", this.svg, { class: "switched" });
     this.halo = svgNode("polyline", this.svg, { class: "halo" });
     this.haloDisc = svgNode("circle", this.svg, { class: "halo disc", r: 0 });
     const layers = ["lines", "stubs", "flows", "bars", "discs", "symbols", "numbers", "crosses", "names"];
@@ -109,7 +110,9 @@ class GridMap {
     const { grid } = this.episode, { names } = this;
     names.replaceChildren();
     if (!kind) return;
-    const text = (x, y, words, size) => { svgNode("text", names, { x, y: -y, "font-size": size }).textContent = words; };
+    const text = (x, y, words, size) => {
+      svgNode("text", names, { x, y: -y, style: `font-size:calc(${size}px * var(--letters))` }).textContent = words;
+    };
     grid.middles.forEach((middle, line) => {
       const [x, y] = between(middle, this.beside[line] ? 0.7 : 0.3);
       text(x, y - 0.05, kind === "numbers" ? line : grid.lineNames[line], 0.15);
@@ -139,7 +142,16 @@ class GridMap {
     this.symbols.forEach((node, symbol) => this.drawSymbol(node, symbol, split, moved));
     if (moved) this.drawSubstations(split);
     this.drawCutOff();
+    this.drawSwitched();
     this.drawHalo();
+  }
+
+  // Rings round what was switched in this step.
+  drawSwitched() {
+    const { episode } = this, { lines, subs } = episode.switched();
+    const ring = ([x, y], r) => `M${x - r} ${-y}a${r} ${r} 0 1 0 ${2 * r} 0a${r} ${r} 0 1 0 ${-2 * r} 0Z`;
+    const rings = [...subs.map(sub => ring(episode.grid.centres[sub], 0.45)), ...lines.map(line => ring(between(episode.grid.middles[line], 0.5), 0.2))];
+    put(this.switched, "d", rings.join(""));
   }
 
   drawLine(node, line, split, colours, moved) {
@@ -199,9 +211,10 @@ class GridMap {
   frame() {
     const { x, y, width, height } = this.view.box;
     this.svg.setAttribute("viewBox", `${x} ${y} ${width} ${height}`);
-    // On a small picture of a large grid, lines are drawn thicker than to scale.
-    const thick = Math.max(1, Math.min(2.2, 30 * width / Math.max(1, this.svg.clientWidth)));
-    this.svg.style.setProperty("--thick", thick.toFixed(2));
+    // On a small picture of a large grid, lines and names are drawn larger than to scale.
+    const unit = width / Math.max(1, this.svg.clientWidth), larger = (factor, most) => Math.max(1, Math.min(most, factor * unit)).toFixed(2);
+    this.svg.style.setProperty("--thick", larger(30, 2.2));
+    this.svg.style.setProperty("--letters", larger(60, 2));
     // Where all is in view, a finger scrolls the page; else it moves the map.
     this.svg.style.touchAction = this.view.isWhole ? "pan-y" : "none";
   }

@@ -222,8 +222,8 @@ class Page {
     place.replaceChildren();
     if (!here) { made("p", place, {}, `${episode.label}: ${episode.ending}`); return; }
     const isLastRound = episode.round === episode.rounds(this.step) - 1;
-    const events = episode.log().filter(([step, kind]) => step === this.step && kind !== "trip" && (isLastRound || kind !== "end"));
-    for (const [, kind, words] of events) made("p", place, {}, `${kind === "heuristic" ? "The heuristic: " : kind === "agent" ? "The agent: " : ""}${words}`);
+    const events = episode.log().filter(([step, kind]) => step === this.step && !["trip", "agent"].includes(kind) && (isLastRound || kind !== "end"));
+    for (const [, kind, words] of events) made("p", place, {}, `${kind === "heuristic" ? "The heuristic: " : ""}${words}`);
     const rounds = episode.cascadeAt.get(this.step);
     if (rounds) this.tellRound(place, rounds);
   }
@@ -238,7 +238,7 @@ class Page {
   }
 
   tellWhy() {
-    const { episode } = this, place = at("why"), number = episode.reasonBefore(episode.step + (episode.step < episode.steps ? 1 : 0));
+    const { episode } = this, place = at("why"), number = this.reasonNow();
     if (this.whyTold === `${this.chosen} ${number} ${episode.step}`) return;
     this.whyTold = `${this.chosen} ${number} ${episode.step}`;
     place.replaceChildren();
@@ -247,6 +247,13 @@ class Page {
       return;
     }
     this.explain(place, episode.reasons[number]);
+  }
+
+  // The decision that led here; else one that is taken now; else the last one.
+  reasonNow() {
+    const { episode } = this, before = episode.reasonBefore(episode.step), now = episode.reasonBefore(episode.step + 1);
+    const justDecided = before >= 0 && episode.reasons[before].step === episode.step - 1;
+    return justDecided || episode.step === episode.steps ? before : now;
   }
 
   explain(place, reason) {
@@ -261,9 +268,18 @@ class Page {
     const rule = episode.words[reason.why];
     if (rule) made("p", place, {}, `Its rule: ${rule}.`);
     made("p", place, {}, this.outcome(reason));
+    this.tellChanges(place, reason.step);
     this.tabulate(place, reason);
     const preference = reason.preference && !this.saysLoading(reason) ? ` ${reason.preference}: what the agent says.` : "";
     made("p", place, { className: "note" }, `Forecast: worst loading of the next step before protections act, of the best of ${reason.tried} actions, of doing nothing and of what was played.${preference}`);
+  }
+
+  tellChanges(place, step) {
+    const { episode } = this, changed = step + 1 < episode.steps ? episode.changedMost(step, 4) : [];
+    if (!changed.length) return;
+    const percent = loading => loading ? `${loading}%` : "out";
+    const words = changed.map(([line, before, after]) => `line ${line} from ${percent(before)} to ${percent(after)}`);
+    made("p", place, {}, `Changed most: ${words.join(", ")}.`);
   }
 
   // What the decision led to.
@@ -329,6 +345,8 @@ class Page {
     if (current === this.marked && this.markedOf === this.chosen) return;
     this.entries[this.marked]?.classList.remove("current");
     this.entries[current]?.classList.add("current");
+    const list = at("log"), entry = this.entries[current];
+    list.scrollTop = entry ? entry.offsetTop - list.clientHeight / 2 : 0;
     [this.marked, this.markedOf] = [current, this.chosen];
   }
 
