@@ -27,8 +27,8 @@ BEST_FILE = "best.pt"
 """In a run folder: the policy with the highest validation survival so far."""
 CHECKPOINT_FILE = "checkpoint.pt"
 """In a run folder: everything needed to go on."""
-_EXPLAINED = 8
-"""Actions of which an explanation tells."""
+_EXPLAINED = 2000
+"""Actions of which an explanation tells at most."""
 MAX_WEIGHT = 1e8
 """A larger one is no weight that was learned."""
 SMALL_NETWORK = 2**24

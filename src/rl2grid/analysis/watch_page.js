@@ -259,17 +259,15 @@ class Page {
   explain(place, reason) {
     const { episode } = this, ago = episode.step - reason.step;
     const when = ago === 0 ? "decides now" : ago === 1 ? "has just decided" : `decided ${ago} steps ago`;
-    const chosen = reason.alternatives.find(alternative => alternative[3]);
     made("h2", place, {}, `Why: the agent ${when} (step ${reason.step})`);
     const before = episode.worstAt(reason.step);
     const loading = episode.loadingAt(before, reason.step);
     made("p", place, {}, `Before: ${percentOf(loading)} on line ${before}${loading < ALARM ? ": the grid is safe" : ""}.`);
-    made("p", place, {}, `It ${chosen && episode.words[chosen[0]] ? `plays: ${episode.words[chosen[0]]}.` : "does nothing."}`);
+    this.tabulate(place, reason);
     const rule = episode.words[reason.why];
     if (rule) made("p", place, {}, `Its rule: ${rule}.`);
     made("p", place, {}, this.outcome(reason));
     this.tellChanges(place, reason.step);
-    this.tabulate(place, reason);
     const preference = reason.preference && !this.saysLoading(reason) ? ` ${reason.preference}: what the agent says.` : "";
     made("p", place, { className: "note" }, `Forecast: worst loading of the next step before protections act, of the best of ${reason.tried} actions, of doing nothing and of what was played.${preference}`);
   }
@@ -296,11 +294,12 @@ class Page {
     const table = made("table", place), head = made("tr", made("thead", table)), body = made("tbody", table);
     const own = reason.preference && !this.saysLoading(reason);
     for (const heading of ["alternative", "forecast", ...(own ? [reason.preference] : [])]) made("th", head, {}, heading);
-    for (const [words, promised, preference, chosen] of reason.alternatives) {
+    const playedFirst = [...reason.alternatives].sort((a, b) => b[3] - a[3]);
+    for (const [words, promised, preference, chosen] of playedFirst) {
       const row = made("tr", body, { className: chosen ? "chosen" : "" });
       made("td", row, {}, `${chosen ? "✓ " : ""}${this.episode.words[words] || "do nothing"}`);
       made("td", row, {}, promised === null ? "–" : promised === "lost" ? "lost" : `${Math.round(promised)}%`);
-      if (own) made("td", row, {}, preference === null ? "–" : String(preference));
+      if (own) made("td", row, {}, preference === null ? "–" : preference.toPrecision(2));
     }
   }
 
