@@ -9,8 +9,8 @@ import pytest
 from sample_results import TASK, curve, result
 
 from rl2grid.analysis import comparison_figures as compare
+from rl2grid.analysis.curves import SMOOTHED_EPISODES
 from rl2grid.analysis.ending_figures import count_endings, draw_ending_bars
-from rl2grid.analysis.figures import SMOOTHED_EPISODES
 from rl2grid.analysis.section import plan_section, results_section
 from rl2grid.analysis.training_figures import COST_PANELS, SCORE_PANELS, draw_panels, logs
 from rl2grid.drawing.theme import DARK

@@ -149,7 +149,7 @@ def draw_ranking(grid: Grid, *, theme: Theme = LIGHT) -> Figure:
     pools = _rank_pools(len(ids), logarithmic)
     position = np.array([1 + pool.mean() for pool in pools])
     with matplotlib.rc_context(style(theme)):
-        figure = Figure(figsize=(6.4, 4.2), layout="constrained")
+        figure = Figure(figsize=(7.2, 4.2), layout="constrained")
         upper, lower = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": [2.2, 1]})
         _close_rows(figure)
         colour = theme.series[0]
@@ -168,7 +168,8 @@ def draw_ranking(grid: Grid, *, theme: Theme = LIGHT) -> Figure:
             axes.grid(axis="y")
         _draw_nothing(upper, lower, tried, theme)
         _draw_boundaries((upper, lower), grid, theme)
-        sentence = "share of trials without a collapse; band: 95% interval of one action; dashed: end of a level"
+        nothing = "; dotted: do nothing" if tried.survived[0] else ""
+        sentence = f"share of trials without a collapse; band: 95% of one action; dashed: end of a level{nothing}"
         figures._headline(upper, f"Ranking of the actions of {grid.id}", sentence)
     return figure
 
@@ -266,10 +267,6 @@ def _draw_nothing(upper: Axes, lower: Axes, tried: Trials, theme: Theme) -> None
         return
     for axes, value in ((upper, tried.survival[0]), (lower, tried.margin[0])):
         axes.axhline(value, color=theme.muted, linewidth=1.0, linestyle=(0, (1, 1.5)))
-    upper.annotate(
-        "do nothing", (0, tried.survival[0]), xycoords=("axes fraction", "data"), xytext=(3, -2.5),
-        textcoords="offset points", va="top", fontsize=7, color=theme.muted,
-    )  # fmt: skip
 
 
 def _draw_boundaries(panels: Sequence[Axes], grid: Grid, theme: Theme) -> None:

@@ -14,38 +14,32 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, PercentFormatter
 
 from rl2grid.analysis import figures
-from rl2grid.analysis.figures import STEPS_PER_DAY
-from rl2grid.analysis.lifetimes import kaplan_meier, lifetimes
+from rl2grid.analysis.curves import leading, leading_methods, lifetime_lines, profile_lines
 from rl2grid.analysis.result_tables import AGGREGATES
 from rl2grid.drawing.theme import BLUE, LIGHT, VERMILLION, Theme, style
 from rl2grid.engines import HEURISTICS
 from rl2grid.mdp.constraint_table import THRESHOLDS
 from rl2grid.records.comparisons import probability_of_improvement
 from rl2grid.records.methods import COSTS, Method, interval_units
-from rl2grid.records.statistics import Estimate, estimate, profile_band
+from rl2grid.records.statistics import Estimate, estimate
 
-THRESHOLDS_DRAWN = 201
-"""Points of a performance profile."""
-_DASHES: tuple[str | tuple[int, tuple[float, ...]], ...] = ("-", (0, (5, 2)), (0, (1, 1.5)))
+MOST_MONTHS_NAMED = 64
+"""Below a figure with a column per month: of more, every second or third."""
 _SURVIVAL = "Share of the episode survived"
 
 
 def draw_profiles(methods: Sequence[Method], *, theme: Theme = LIGHT) -> Figure:
     """Performance profiles: the share of episodes that survived longer than each share, with 95% bands."""
-    levels = np.linspace(0, 1, THRESHOLDS_DRAWN)
+    shown, of_all = leading_methods(methods)
     with matplotlib.rc_context(style(theme)):
-        figure, axes = _figure()
-        for method, colour, dashes in _looks(methods, theme):
-            share, low, high = profile_band(method.scores("survival"), levels)
-            # Nothing is longer than a completed episode: the last point would always be 0.
-            shown = slice(0, -1)
-            axes.fill_between(levels[shown], low[shown], high[shown], color=colour, alpha=_band(methods), linewidth=0)
-            axes.plot(levels[shown], share[shown], color=colour, linestyle=dashes, linewidth=1.8, label=method.label)
+        figure, axes = _figure([method.label for method in shown])
+        for line in profile_lines(shown):
+            figures.draw_line(axes, line, theme, linewidth=1.8, band=_band(shown))
         axes.set(xlim=(0, 1), ylim=(0, 1.03), xlabel=f"{_SURVIVAL}, τ", ylabel="Share of episodes beyond τ")
         _percent(axes.xaxis, axes.yaxis)
         axes.grid()
-        _legend(figure)
-        sentence = f"band: 95% interval over {interval_units(methods)}"
+        figures.legend_beside(axes)
+        sentence = f"{of_all}band: 95% interval over {interval_units(shown)}"
         figures._headline(axes, _title("Performance profiles", methods), sentence)
     return figure
 
@@ -57,7 +51,7 @@ def draw_aggregates(methods: Sequence[Method], *, theme: Theme = LIGHT) -> Figur
         panels = list(figure.subplots(1, len(AGGREGATES), sharey=True))
         for axes, (name, rule) in zip(panels, AGGREGATES.items(), strict=True):
             values = [estimate(method.scores("survival"), rule) for method in methods]
-            _draw_intervals(axes, values, methods, theme)
+            _draw_intervals(axes, values, theme)
             axes.set_xlabel(f"{name[0].upper()}{name[1:]}")
             axes.xaxis.set_major_formatter(PercentFormatter(1.0, symbol=""))
         _name_rows(panels[0], methods)
@@ -68,6 +62,7 @@ def draw_aggregates(methods: Sequence[Method], *, theme: Theme = LIGHT) -> Figur
 
 def draw_improvements(methods: Sequence[Method], *, theme: Theme = LIGHT) -> Figure:
     """P(row survives longer than column) in the same month, with 95% intervals in small print."""
+    methods, of_all = leading_methods(methods)
     n = len(methods)
     with matplotlib.rc_context(style(theme)):
         figure = Figure(figsize=(max(5.4, 2.2 + 0.72 * n), 1.9 + 0.5 * n), layout="constrained")
@@ -84,12 +79,12 @@ def draw_improvements(methods: Sequence[Method], *, theme: Theme = LIGHT) -> Fig
             axes.text(
                 column, row + 0.24, f"[{value.low:.2f}, {value.high:.2f}]", ha="center", va="center", fontsize=5.5
             )
-        labels = [method.label for method in methods]
+        labels = [figures.wrapped_label(method.label) for method in methods]
         axes.set_xticks(range(n), labels, rotation=35, ha="right")
         axes.set_yticks(range(n), labels)
         axes.set(xlim=(-0.5, n - 0.5), ylim=(n - 0.5, -0.5), xlabel="Y", ylabel="X")
         _no_frame(axes)
-        sentence = "blue: X survives longer than Y in the same month; 95% intervals below"
+        sentence = f"{of_all}blue: X survives longer than Y in the same month; 95% intervals below"
         figures._headline(axes, _title("P(X > Y)", methods), sentence)
     return figure
 
@@ -141,8 +136,9 @@ def draw_scenarios(methods: Sequence[Method], *, theme: Theme = LIGHT) -> Figure
         image = axes.imshow(survival[rows][:, columns], cmap=colours, norm=Normalize(0, 1), aspect="auto")
         complete = np.argwhere(survival[rows][:, columns] == 1)
         axes.plot(complete[:, 1], complete[:, 0], ".", color=theme.background, markersize=3)
-        axes.set_yticks(range(len(methods)), [methods[row].label for row in rows])
-        axes.set_xticks(range(len(names)), names, rotation=90, fontsize=6)
+        axes.set_yticks(range(len(methods)), [figures.wrapped_label(methods[row].label) for row in rows])
+        every = -(-len(names) // MOST_MONTHS_NAMED)
+        axes.set_xticks(range(0, len(names), every), names[::every], rotation=90, fontsize=6)
         _no_frame(axes)
         bar = figure.colorbar(image, ax=axes, pad=0.01, fraction=0.03)
         bar.ax.yaxis.set_major_formatter(PercentFormatter(1.0))
@@ -154,22 +150,22 @@ def draw_scenarios(methods: Sequence[Method], *, theme: Theme = LIGHT) -> Figure
 
 def draw_lifetimes(methods: Sequence[Method], *, theme: Theme = LIGHT) -> Figure:
     """Kaplan-Meier curves: the share of grids alive over time, completed episodes being censored (ticks)."""
+    shown, of_all = leading_methods(methods)
     with matplotlib.rc_context(style(theme)):
-        figure, axes = _figure()
-        end = max(episode.episode_length for method in methods for episode in method.episodes) / STEPS_PER_DAY
-        for method, colour, dashes in _looks(methods, theme):
-            curve = kaplan_meier(lifetimes([result.episodes for result in method.evaluations]))
-            days = np.append(curve.steps / STEPS_PER_DAY, end)
-            alive, low, high = (np.append(values, values[-1]) for values in (curve.alive, curve.low, curve.high))
-            axes.fill_between(days, low, high, step="post", color=colour, alpha=_band(methods), linewidth=0)
-            axes.step(days, alive, where="post", color=colour, linestyle=dashes, linewidth=1.8, label=method.label)
-            if curve.censored.size:
-                axes.plot(end, alive[-1], "|", color=colour, markersize=9, markeredgewidth=1.6, clip_on=False)
-        axes.set(xlim=(0, end), ylim=(0, 1.03), xlabel="Days", ylabel="Grids alive")
+        figure, axes = _figure([method.label for method in shown])
+        lines = lifetime_lines(shown)
+        for line in lines:
+            figures.draw_line(axes, line, theme, linewidth=1.8, band=_band(shown), steps=True)
+            if line.marks:
+                colour, _ = figures.look(line, theme)
+                axes.plot(
+                    line.marks.x, line.marks.y, "|", color=colour, markersize=9, markeredgewidth=1.6, clip_on=False
+                )
+        axes.set(xlim=(0, lines[0].x[-1]), ylim=(0, 1.03), xlabel="Days", ylabel="Grids alive")
         _percent(axes.yaxis)
         axes.grid()
-        _legend(figure)
-        sentence = f"Kaplan-Meier, 95% bands over {interval_units(methods)}; tick: completed episodes"
+        figures.legend_beside(axes)
+        sentence = f"{of_all}Kaplan-Meier, 95% bands over {interval_units(shown)}; tick: completed episodes"
         figures._headline(axes, _title("Time to failure", methods), sentence)
     return figure
 
@@ -224,23 +220,25 @@ def _draw_ablation(
     points: Sequence[tuple[str, str, Method]], ticks: Sequence[str], axis: str, title: str, theme: Theme
 ) -> Figure:
     """Survival of (line, tick, method); lines side by side, so that their intervals are seen."""
+    estimates = [(label, ticks.index(tick), estimate(method.scores("survival"))) for label, tick, method in points]
+    labels, of_all = leading({label: [e.value for name, _, e in estimates if name == label] for label, *_ in points})
     with matplotlib.rc_context(style(theme)):
-        figure, axes = _figure()
-        labels = list(dict.fromkeys(label for label, _, _ in points))
+        figure, axes = _figure(labels)
         for k, label in enumerate(labels):
-            own = [(ticks.index(tick), estimate(m.scores("survival"))) for name, tick, m in points if name == label]
-            own.sort(key=lambda point: point[0])
-            x = np.array([place for place, _ in own]) + 0.5 * (k - (len(labels) - 1) / 2) / len(labels)
-            colour, dashes = theme.series[k % len(theme.series)], _DASHES[k // len(theme.series) % len(_DASHES)]
-            axes.vlines(x, [e.low for _, e in own], [e.high for _, e in own], color=colour, alpha=0.5, linewidth=4)
-            values = [e.value for _, e in own]
-            axes.plot(x, values, color=colour, linestyle=dashes, marker="o", linewidth=1, markersize=5, label=label)
+            own = sorted((place, e.value, e.low, e.high) for name, place, e in estimates if name == label)
+            place, values, low, high = np.array(own).T
+            x = place + 0.5 * (k - (len(labels) - 1) / 2) / len(labels)
+            colour, dashes = figures.look_of(k, theme)
+            axes.vlines(x, low, high, color=colour, alpha=0.5, linewidth=4)
+            name = figures.wrapped_label(label)
+            axes.plot(x, values, color=colour, linestyle=dashes, marker="o", linewidth=1, markersize=5, label=name)
         axes.set_xticks(range(len(ticks)), ticks)
         axes.set(xlim=(-0.5, len(ticks) - 0.5), ylim=(0, 1.03), xlabel=axis, ylabel=_SURVIVAL)
         _percent(axes.yaxis)
         axes.grid(axis="y")
-        _legend(figure)
-        figures._headline(axes, title, f"bar: 95% interval over {interval_units([method for _, _, method in points])}")
+        figures.legend_beside(axes)
+        units = interval_units([method for label, _, method in points if label in labels])
+        figures._headline(axes, title, f"{of_all}bar: 95% interval over {units}")
     return figure
 
 
@@ -249,19 +247,15 @@ def _band(methods: Sequence[Method]) -> float:
     return min(0.2, 0.7 / len(methods))
 
 
-def _figure() -> tuple[Figure, Axes]:
-    figure = Figure(figsize=(7.4, 3.8), layout="constrained")
+def _figure(labels: Sequence[str]) -> tuple[Figure, Axes]:
+    """With room for a legend beside the axes."""
+    figure = Figure(figsize=(7.4, figures.height_beside(labels)), layout="constrained")
     return figure, figure.subplots()
 
 
-def _looks(methods: Sequence[Method], theme: Theme) -> list[tuple[Method, str, str | tuple[int, tuple[float, ...]]]]:
-    """Colour and dashes of each method; dashes change when the colours are used up."""
-    n = len(theme.series)
-    return [(method, theme.series[k % n], _DASHES[k // n % len(_DASHES)]) for k, method in enumerate(methods)]
-
-
-def _draw_intervals(axes: Axes, values: Sequence[Estimate], methods: Sequence[Method], theme: Theme) -> None:
-    for row, (value, (_, colour, _)) in enumerate(zip(values, _looks(methods, theme), strict=True)):
+def _draw_intervals(axes: Axes, values: Sequence[Estimate], theme: Theme) -> None:
+    for row, value in enumerate(values):
+        colour, _ = figures.look_of(row, theme)
         axes.fill_between([value.low, value.high], row - 0.32, row + 0.32, color=colour, alpha=0.45, linewidth=0)
         axes.plot([value.value] * 2, [row - 0.36, row + 0.36], color=theme.text, linewidth=1.8)
     axes.grid(axis="x")
@@ -276,7 +270,7 @@ def _draw_bars(axes: Axes, values: Sequence[Estimate], colour: str, theme: Theme
 
 
 def _name_rows(axes: Axes, methods: Sequence[Method]) -> None:
-    axes.set_yticks(range(len(methods)), [method.label for method in methods])
+    axes.set_yticks(range(len(methods)), [figures.wrapped_label(method.label) for method in methods])
     axes.set_ylim(len(methods) - 0.45, -0.55)
     figure = axes.get_figure()
     assert figure is not None
@@ -294,10 +288,6 @@ def _no_frame(axes: Axes) -> None:
 def _percent(*sides: matplotlib.axis.Axis) -> None:
     for side in sides:
         side.set_major_formatter(PercentFormatter(1.0))
-
-
-def _legend(figure: Figure) -> None:
-    figure.legend(loc="outside right upper", handlelength=2.2)
 
 
 def _title(words: str, methods: Sequence[Method]) -> str:

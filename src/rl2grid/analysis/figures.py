@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import io
 import itertools
-from collections.abc import Iterator, Sequence
+import textwrap
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from matplotlib.text import Annotation
 from matplotlib.ticker import FuncFormatter, PercentFormatter
 from numpy.typing import NDArray
 
+from rl2grid.analysis.curves import SMOOTHED_EPISODES, STEPS_PER_DAY, Line, leading_curves, training_lines
 from rl2grid.arrays import F64
 from rl2grid.drawing.theme import (
     FULL_SCALE,
@@ -39,17 +41,17 @@ from rl2grid.records.evaluations import Evaluation
 from rl2grid.records.files import write_bytes
 from rl2grid.records.metrics import SURVIVAL
 from rl2grid.records.recordings import Recording
-from rl2grid.records.statistics import curve_band, episode_mean
-from rl2grid.records.trainings import Metric, TrainingCurve
+from rl2grid.records.trainings import TrainingCurve
 
-STEPS_PER_DAY = 288
 MAX_COLUMNS = 360
 """Columns of a heatmap: more steps are pooled, each pool showing its highest loading, so that an overload of one
 step is wide enough to be seen."""
 MAX_LABELS = 40
-CURVE_POINTS = 200
-SMOOTHED_EPISODES = 500
-"""Episodes over which training curves are smoothed (paper, Section 5)."""
+LABEL_LETTERS = 30
+"""Of a line of a label beside axes."""
+Dashes = str | tuple[int, tuple[float, ...]]
+"""A line style of Matplotlib."""
+DASHES: tuple[Dashes, ...] = ("-", (0, (5, 2)), (0, (1, 1.5)))
 
 
 def training_curves(
@@ -57,8 +59,9 @@ def training_curves(
 ) -> Figure:
     """Survival of training episodes against the budget; runs with one label are one line.
 
-    Means over the last :data:`SMOOTHED_EPISODES` episodes (paper, Section 5): one run over points that stay
-    visible, several runs as their mean with a 95% bootstrap interval over runs. Diamonds are validation.
+    Means over the last :data:`~rl2grid.analysis.curves.SMOOTHED_EPISODES` episodes (paper, Section 5): one run over
+    points that stay visible, several runs as their mean with a 95% interval over runs. Diamonds are validation. Of many
+    labels, those that end highest.
 
     Args:
         curves: at least one; see :func:`rl2grid.records.trainings.read_training_curve`.
@@ -66,54 +69,84 @@ def training_curves(
         theme: colours.
         title: of the figure.
     """
+    shown, of_all = leading_curves(curves)
+    lines = training_lines(shown, SURVIVAL, x=x, validation=True)
     with matplotlib.rc_context(style(theme)):
-        figure = Figure(figsize=(6.4, 3.6), layout="constrained")
+        figure = Figure(figsize=(7.4, height_beside([line.label for line in lines])), layout="constrained")
         axes = figure.subplots()
-        draw_metric(axes, curves, SURVIVAL, x=x, theme=theme)
-        draw_validation(axes, curves, x=x, theme=theme)
+        draw_metric(axes, lines, x=x, theme=theme)
         axes.set_ylim(0, 1.03)
         axes.yaxis.set_major_formatter(PercentFormatter(1.0))
-        _headline(axes, title, training_sentence(curves, "share of the episode survived"))
+        _headline(axes, title, of_all + training_sentence(shown, "share of the episode survived"))
         handles, _ = axes.get_legend_handles_labels()
-        if any(curve.validation for curve in curves):
+        if any(line.marks for line in lines):
             handles.append(_marker("D", theme.text, "validation"))
-        axes.legend(handles=handles, loc="lower right")
+        legend_beside(axes, handles)
     return figure
 
 
-def draw_metric(
-    axes: Axes, curves: Sequence[TrainingCurve], metric: str, *, x: str = "decisions", theme: Theme = LIGHT
-) -> None:
+def draw_metric(axes: Axes, lines: Sequence[Line], *, x: str = "decisions", theme: Theme = LIGHT) -> None:
     """A metric of training episodes against the budget, on axes that may hold others; see :func:`training_curves`."""
-    for label, runs, colour in labelled_runs(curves, theme):
-        logged = [run.metrics[metric] for run in runs if metric in run.metrics]
-        if logged:
-            name = label if len(logged) == 1 else f"{label} ({len(logged)} runs)"
-            _draw_runs(axes, name, logged, x, colour)
+    for line in lines:
+        draw_line(axes, line, theme, linewidth=2.0, band=0.2)
+        if line.marks:
+            axes.plot(
+                line.marks.x, line.marks.y, "D", color=look(line, theme)[0], markersize=5.5,
+                markeredgecolor=theme.background, zorder=4,
+            )  # fmt: skip
     axes.set_xlabel("Decisions" if x == "decisions" else "Grid steps")
     axes.set_xlim(left=0)
     axes.xaxis.set_major_formatter(FuncFormatter(_thousands))
     axes.grid(axis="y")
 
 
-def draw_validation(axes: Axes, curves: Sequence[TrainingCurve], *, x: str = "decisions", theme: Theme = LIGHT) -> None:
-    """Survival on the validation scenarios: mean over runs, at the points of the run with the fewest."""
-    for _, runs, colour in labelled_runs(curves, theme):
-        validated = [(getattr(run.validation, x), run.validation.values) for run in runs if run.validation]
-        if not validated:
-            continue
-        position = min((budget for budget, _ in validated), key=len)
-        survival = np.mean([np.interp(position, *points) for points in validated], axis=0)
-        axes.plot(position, survival, "D", color=colour, markersize=5.5, markeredgecolor=theme.background, zorder=4)
+def draw_line(axes: Axes, line: Line, theme: Theme, *, linewidth: float, band: float, steps: bool = False) -> None:
+    """A curve with its dots and its band, which is as opaque as ``band`` says; ``steps`` draws a staircase."""
+    colour, dashes = look(line, theme)
+    if line.dots:
+        axes.plot(line.dots.x, line.dots.y, ".", color=colour, alpha=0.25, markersize=3, markeredgewidth=0)
+    if line.low is not None and line.high is not None:
+        step = {"step": "post"} if steps else {}
+        axes.fill_between(line.x, line.low, line.high, color=colour, alpha=band, linewidth=0, **step)  # type: ignore[arg-type]
+    drawstyle = "steps-post" if steps else "default"
+    axes.plot(
+        line.x, line.y, color=colour, linestyle=dashes, linewidth=linewidth, drawstyle=drawstyle,
+        label=wrapped_label(line.label),
+    )  # fmt: skip
 
 
-def labelled_runs(
-    curves: Sequence[TrainingCurve], theme: Theme
-) -> Iterator[tuple[str, tuple[TrainingCurve, ...], str]]:
-    """Runs by label, in order of appearance, each with its colour."""
-    labels = dict.fromkeys(curve.label for curve in curves)
-    for label, colour in zip(labels, itertools.cycle(theme.series), strict=False):
-        yield label, tuple(curve for curve in curves if curve.label == label), colour
+def look(line: Line, theme: Theme) -> tuple[str, Dashes]:
+    """Colour and dashes of a curve; dashes change when the colours are used up."""
+    return look_of(line.look, theme)
+
+
+def look_of(place: int, theme: Theme) -> tuple[str, Dashes]:
+    """Colour and dashes of the method in a place."""
+    n = len(theme.series)
+    return theme.series[place % n], DASHES[place // n % len(DASHES)]
+
+
+def legend_beside(axes: Axes, handles: Sequence[Any] | None = None) -> None:
+    """A legend to the right of the axes, where it covers neither curves nor the headline."""
+    chosen = axes.get_legend_handles_labels()[0] if handles is None else list(handles)
+    axes.legend(handles=chosen, loc="upper left", bbox_to_anchor=(1.015, 1.0), borderaxespad=0.0, handlelength=2.2)
+
+
+def height_beside(labels: Sequence[str]) -> float:
+    """Height in inches of a figure beside which a legend with these labels, and one more line, has room."""
+    lines = 1 + sum(1 + wrapped_label(label).count("\n") for label in labels)
+    return max(3.8, 1.3 + 0.165 * lines)
+
+
+def legend_columns(labels: Sequence[str], width: float) -> int:
+    """How many columns of a legend go below a figure that is ``width`` inches wide."""
+    longest = max((len(line) for label in labels for line in label.splitlines()), default=1)
+    return int(np.clip(width / (0.075 * longest + 0.55), 1, max(len(labels), 1)))
+
+
+def wrapped_label(label: str) -> str:
+    """A label in lines of :data:`LABEL_LETTERS` letters: what is beside or below axes takes their room."""
+    return "\n".join(textwrap.wrap(label, LABEL_LETTERS)) or label
 
 
 def training_sentence(curves: Sequence[TrainingCurve], measure: str) -> str:
@@ -200,20 +233,6 @@ def _render(figure: Figure, suffix: str) -> bytes:
     metadata = {"png": {"Software": None}, "pdf": {"CreationDate": None}}.get(suffix)
     figure.savefig(file, format=suffix, dpi=200, metadata=metadata, facecolor=figure.get_facecolor())
     return file.getvalue()
-
-
-def _draw_runs(axes: Axes, label: str, runs: Sequence[Metric], x: str, colour: str) -> None:
-    budgets = [np.asarray(getattr(run, x), np.float64) for run in runs]
-    smoothed = [episode_mean(run.values, run.episodes, SMOOTHED_EPISODES) for run in runs]
-    if len(runs) == 1:
-        axes.plot(budgets[0], runs[0].values, ".", color=colour, alpha=0.25, markersize=3, markeredgewidth=0)
-        axes.plot(budgets[0], smoothed[0], color=colour, linewidth=2, label=label)
-        return
-    position = np.linspace(max(budget[0] for budget in budgets), min(budget[-1] for budget in budgets), CURVE_POINTS)
-    lines = [np.interp(position, budget, line) for budget, line in zip(budgets, smoothed, strict=True)]
-    average, low, high = curve_band(lines)
-    axes.fill_between(position, low, high, color=colour, alpha=0.2, linewidth=0)
-    axes.plot(position, average, color=colour, linewidth=2, label=label)
 
 
 def _draw_agent(axes: Axes, row: int, result: Evaluation, colour: str, theme: Theme) -> None:

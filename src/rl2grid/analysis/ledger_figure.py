@@ -47,7 +47,8 @@ def draw_ledger(results: Mapping[str, HashedTest], task: str, *, theme: Theme = 
         axes.grid(axis="x")
         axes.set_title(f"{short_id(task)}, test months", loc="left")
         if any(row.first.training for row in rows):
-            axes.legend(handles=_legend(theme), loc="lower right", frameon=False)
+            # Below the axes, where it covers no result.
+            figure.legend(handles=_legend(theme), loc="outside lower center", ncols=2, frameon=False)
     return figure
 
 

@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 
 from rl2grid.analysis import comparison_figures as compare
 from rl2grid.analysis import figures
+from rl2grid.analysis.curves import SMOOTHED_EPISODES
 from rl2grid.analysis.ending_figures import draw_ending_bars, draw_ending_map
 from rl2grid.analysis.result_tables import Methods, result_tables
 from rl2grid.analysis.table import WRITERS, ResultTable
@@ -120,7 +121,7 @@ def training_pictures(curves: CurvesByTask) -> Iterator[Picture]:
         short, runs = short_id(task), [run for labelled in group.values() for run in labelled]
         yield Picture(
             f"training-{short}",
-            f"Survival in training on {short}, mean over {figures.SMOOTHED_EPISODES} episodes; diamonds: validation.",
+            f"Survival in training on {short}, mean over {SMOOTHED_EPISODES} episodes; diamonds: validation.",
             lambda theme, runs=runs, short=short: figures.training_curves(  # type: ignore[misc]
                 runs, theme=theme, title=f"Survival in training: {short}"
             ),

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, PercentFormatter
 
 from rl2grid.analysis import figures
+from rl2grid.analysis.curves import leading_curves, training_lines
 from rl2grid.drawing.theme import LIGHT, VERMILLION, Theme, style
 from rl2grid.mdp.constraint_table import CONSTRAINTS
 from rl2grid.records.metrics import SURVIVAL
@@ -60,12 +61,12 @@ def draw_panels(
         x: ``"decisions"`` or ``"grid_steps"``.
         theme: colours.
     """
-    runs = [run for group in curves.values() for run in group]
+    shown, of_all = leading_curves([run for group in curves.values() for run in group])
     with matplotlib.rc_context(style(theme)):
         figure = Figure(figsize=(3.0 * len(panels), 3.5), layout="constrained")
         grid = list(figure.subplots(1, len(panels), squeeze=False)[0])
         for axes, panel in zip(grid, panels, strict=True):
-            figures.draw_metric(axes, runs, panel.metric, x=x, theme=theme)
+            figures.draw_metric(axes, training_lines(shown, panel.metric, x=x), x=x, theme=theme)
             axes.yaxis.set_major_formatter(FuncFormatter(_signed_thousands))
             if panel.metric == SURVIVAL:
                 axes.set_ylim(0, 1.03)
@@ -76,9 +77,10 @@ def draw_panels(
             axes.annotate(
                 panel.title, (0, 1), xycoords="axes fraction", xytext=(0, 4), textcoords="offset points", fontsize=8
             )
-        figures.headline_of_panels(figure, title, figures.training_sentence(runs, "training episodes"))
+        figures.headline_of_panels(figure, title, of_all + figures.training_sentence(shown, "training episodes"))
         handles, labels = grid[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 5), frameon=False)
+        columns = figures.legend_columns(labels, figure.get_figwidth())
+        figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False)
     return figure
 
 
