@@ -123,7 +123,13 @@ def test_a_report_is_one_page_with_everything(tmp_path):
     parser = Page()
     parser.feed(text)
     assert parser.open == []
-    assert len(parser.fetched) == 6  # three figures, light and dark
+    assert len(parser.fetched) == 4  # two figures, light and dark
+    assert text.count("<figure class=chart>") == 1  # training
+    first, second = re.findall(r"<tr[^>]*><td>([^<]*)", text)[:2]
+    assert (first, second) == ("ppo", "do-nothing")
+    assert text.count("<tr class=best>") == 1
+    assert "2 months are too few to prove an order." in text
+    assert "ppo: one training." not in text  # nothing says that it was trained
     assert all(address.startswith("data:image/png;base64,") for address in parser.fetched)
     assert "http" not in re.sub(r"base64,[^']*", "", text)
     assert "A &lt;b&gt;title&lt;/b&gt;" in text

@@ -100,6 +100,33 @@ def test_pages_of_the_table_turn_and_lead_to_commands(report):
         assert page.locator("#e1").is_visible()
 
 
+def test_curves_are_read_zoomed_and_switched(report):
+    with visiting(report, DESK) as visit:
+        page = visit.page
+        chart = page.locator("figure.chart").filter(has_text="Performance profiles")
+        axes, readout = chart.locator("svg.axes"), chart.locator(".readout")
+        axes.scroll_into_view_if_needed()
+        box = axes.bounding_box()
+        page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+        assert readout.is_visible()
+        assert "do-nothing" in readout.inner_text()
+        whole = axes.locator("text").all_text_contents()
+        page.mouse.down()
+        page.mouse.move(box["x"] + 0.8 * box["width"], box["y"] + 0.7 * box["height"], steps=3)
+        page.mouse.up()
+        assert axes.locator("text").all_text_contents() != whole
+        assert chart.get_by_role("button", name="Whole").is_visible()
+        page.mouse.move(0, 0)
+        chart.get_by_role("button", name="Whole").click()
+        assert axes.locator("text").all_text_contents() == whole
+        key = chart.locator(".keys button").filter(has_text="do-nothing")
+        key.click()
+        assert key.get_attribute("aria-pressed") == "false"
+        page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+        assert "do-nothing" not in readout.inner_text()
+        assert visit.errors == []
+
+
 def test_the_slider_of_an_episode_moves_the_clock(watch):
     with visiting(watch, PHONE) as visit:
         before = visit.page.locator("#clock").inner_text()

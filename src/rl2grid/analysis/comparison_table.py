@@ -15,6 +15,8 @@ from rl2grid.records.methods import Method, interval_words, is_fair
 
 COMPARED = "survival"
 """The column that methods are compared by."""
+MOST_COMPARED = 12
+"""Methods of which every pair is a row: 66 rows."""
 
 
 def pairwise(methods: Sequence[Method]) -> dict[tuple[int, int], Difference]:
@@ -38,8 +40,10 @@ def pair_cells(difference: Difference | None) -> tuple[Cell, Cell]:
 def comparison_table(methods: Mapping[str, Sequence[Method]]) -> ResultTable:
     """Every pair of methods of a task: who survives how much longer in the same month, and how surely.
 
+    Of more than :data:`MOST_COMPARED` methods the pairs with the first one alone: there are too many others to be read.
+
     Args:
-        methods: by task.
+        methods: by task, each in the order of its ranking.
     """
     columns = (
         Column("Task", words=True),
@@ -55,13 +59,17 @@ def comparison_table(methods: Mapping[str, Sequence[Method]]) -> ResultTable:
     for group in methods.values():
         found = pairwise(group)
         for (x, one), (y, other) in itertools.combinations(enumerate(group), 2):
+            if x and len(group) > MOST_COMPARED:
+                break
             improvement = probability_of_improvement(one.scores(COMPARED), other.scores(COMPARED))
             medians = [Cell(_steps(_median_life(method))) for method in (one, other)]
             names = (Cell(short_id(one.task.id)), Cell(one.label), Cell(other.label))
             rows.append((*names, *pair_cells(found.get((x, y))), interval_cell(improvement), *medians))
     everyone = [method for group in methods.values() for method in group]
+    first = any(len(group) > MOST_COMPARED for group in methods.values())
+    which = f"Where there are more than {MOST_COMPARED} methods, pairs with the first of the ranking. " if first else ""
     caption = (
-        "X - Y: how much more of a month X survives than Y in the same months. p: that there is no difference, "
+        f"{which}X - Y: how much more of a month X survives than Y in the same months. p: that there is no difference, "
         "two-sided, Holm's correction over all pairs of the task; trainings with different budgets are no pair. "
         "P(X > Y): how probably X survives longer in the same month, ties counted half. Median life: grid steps after "
         "which half of the episodes are lost (Kaplan-Meier; a dash where more than half are completed). "

@@ -102,13 +102,13 @@ def lifetime_lines(methods: Sequence[Method]) -> list[Line]:
     return _best_first(lines)
 
 
-def leading(scores: Mapping[str, Sequence[float]]) -> tuple[list[str], str]:
-    """Of more than :data:`MOST_LINES` labels those with the highest mean score, and words that say so.
+def leading(scores: Mapping[str, Sequence[float]], most: int = MOST_LINES) -> tuple[list[str], str]:
+    """Of more than ``most`` labels those with the highest mean score, and words that say so.
 
     Labels stay in their order.
     """
-    best = sorted(scores, key=lambda label: -float(np.mean(scores[label])))[:MOST_LINES]
-    words = f"the best {MOST_LINES} of {len(scores)}; " if len(scores) > MOST_LINES else ""
+    best = sorted(scores, key=lambda label: -float(np.mean(scores[label])))[:most]
+    words = f"the best {most} of {len(scores)}; " if len(scores) > most else ""
     return [label for label in scores if label in best], words
 
 

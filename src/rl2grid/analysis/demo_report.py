@@ -16,11 +16,22 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from rl2grid.analysis import figures, summary_table
+from rl2grid.analysis.cautions import cautions
+from rl2grid.analysis.chart import training_chart
 from rl2grid.analysis.comparison_table import reference_table
-from rl2grid.analysis.page import cell_html, code_html, commands_html, result_table_html, scrolling, table_html
+from rl2grid.analysis.page import (
+    cautions_html,
+    cell_html,
+    code_html,
+    commands_html,
+    result_table_html,
+    scrolling,
+    table_html,
+)
 from rl2grid.analysis.page_builder import PageBuilder
 from rl2grid.analysis.section import Picture
 from rl2grid.analysis.table import table_markdown
+from rl2grid.analysis.training_figures import SURVIVAL_PANELS
 from rl2grid.drawing.theme import Theme
 from rl2grid.records.evaluations import Evaluation, check_comparable
 from rl2grid.records.files import write_text
@@ -46,7 +57,8 @@ def write_demo_report(
 
     Args:
         folder: made if need be; files of an earlier report are replaced.
-        results: evaluations of one task, at least one; agents appear in this order in the table.
+        results: evaluations of one task, at least one; the table has the best first, and compares them with the
+            first given.
         title: headline of the page.
         introduction: a sentence or two below it.
         curves: training runs; none: no training curve.
@@ -60,18 +72,21 @@ def write_demo_report(
     check_comparable(results)
     commands = dict(commands or {})
     summaries = [result.summary for result in results]
+    ranked = sorted(summaries, key=lambda summary: -summary.survival.value)
     page = PageBuilder(title)
     page.add_header(_facts(summaries), introduction=introduction)
     legend = f"<p class=note>{html.escape(summary_table.LEGEND)}</p>"
-    (methods,) = group_methods(results).values()
+    by_task = group_methods(results)
+    (methods,) = by_task.values()
+    page.add(cautions_html(cautions(by_task)))
     differences = [reference_table(methods)] if len(methods) > 1 else []
-    page.add_section("Results", f"{_table_html(summaries)}{legend}{''.join(map(result_table_html, differences))}")
+    page.add_section("Results", f"{_table_html(ranked)}{legend}{''.join(map(result_table_html, differences))}")
     pictures = _pictures(results, curves, recordings)
     page.add_figures(pictures, lambda picture: _made_by(picture, commands), folder=folder / FIGURES_FOLDER)
-    page.add_section("How episodes ended", _endings_html(summaries))
+    page.add_section("How episodes ended", _endings_html(ranked))
     page.add_section("What made every number", _commands_html(results, commands))
     page.add_identities([(result.summary.agent, result.identity) for result in results])
-    tables = [f"{summary_table.markdown_table(summaries)}\n{summary_table.LEGEND}\n", *map(table_markdown, differences)]
+    tables = [f"{summary_table.markdown_table(ranked)}\n{summary_table.LEGEND}\n", *map(table_markdown, differences)]
     write_text(folder / TABLE_FILE, "\n".join([f"# {title}\n", *tables]))
     page.write(folder / REPORT_FILE)
     return folder / REPORT_FILE
@@ -95,6 +110,7 @@ def _pictures(
                 "training",
                 "Survival of the episodes that ended in training, smoothed; diamonds: validation scenarios.",
                 lambda theme: figures.training_curves(curves, theme=theme),
+                chart=lambda: training_chart({"": curves}, SURVIVAL_PANELS, title="Survival in training"),
             )
         )
     for number, recording in enumerate(recordings):

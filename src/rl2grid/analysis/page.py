@@ -15,6 +15,9 @@ from rl2grid.analysis.table import Cell, ResultTable
 from rl2grid.records.evaluations import identity_hash
 from rl2grid.records.files import printable, write_text
 
+FOLDED_FROM = 15
+"""Rows of a table that are always shown."""
+
 
 def write_page(path: Path, title: str, parts: Sequence[str]) -> None:
     """Write one HTML page that needs no other file, in the place of an earlier one; ``parts`` are HTML."""
@@ -44,13 +47,16 @@ def table_html(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return scrolling(head, body)
 
 
-def result_table_html(table: ResultTable, *, links: Sequence[str] = (), made: str = "") -> str:
-    """A table of results with its caption.
+def result_table_html(
+    table: ResultTable, *, links: Sequence[str] = (), made: str = "", best_first: bool = False
+) -> str:
+    """A table of results with its caption; of a long one, the rows behind the first are shown on demand.
 
     Args:
         table: the table.
         links: HTML of one more cell at the end of each row, which says what made it; none: there is no such column.
         made: HTML behind the caption, which says what made the table.
+        best_first: whether the first of several rows is the best, and is marked.
     """
     grouped = any(column.group for column in table.columns)
     groups = ""
@@ -66,11 +72,18 @@ def result_table_html(table: ResultTable, *, links: Sequence[str] = (), made: st
     for number, row in enumerate(table.rows):
         cells = "".join(f"<td{w}>{_result_cell(cell)}</td>" for cell, w in zip(row, words, strict=True))
         cells += f"<td class='words links'>{links[number]}</td>" if links else ""
-        rows.append(f"<tr>{cells}</tr>")
+        is_best = best_first and number == 0 and len(table.rows) > 1
+        rows.append(f"<tr{' class=best' if is_best else ''}>{cells}</tr>")
     return (
-        f"<div class=scroll><table class=typed><thead>{groups}<tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody>"
-        f"</table></div><p class=note>{html.escape(table.caption)}{made}</p>"
+        f"<div>{_fold(table)}<div class=scroll><table class=typed><thead>{groups}<tr>{head}</tr></thead>"
+        f"<tbody>{''.join(rows)}</tbody></table></div></div><p class=note>{html.escape(table.caption)}{made}</p>"
     )
+
+
+def cautions_html(sentences: Sequence[str]) -> str:
+    """What results are too few to prove, so that it is seen; nothing without sentences."""
+    items = "".join(f"<li>{html.escape(sentence)}</li>" for sentence in sentences)
+    return f"<aside class=caution><b>Mind</b><ul>{items}</ul></aside>" if items else ""
 
 
 def figure_html(caption: str, light: bytes, dark: bytes, made: str = "") -> str:
@@ -117,6 +130,14 @@ def identities_html(identities: Sequence[tuple[str, Mapping[str, Any]]]) -> str:
     )
 
 
+def _fold(table: ResultTable) -> str:
+    """The switch of a long table, which has to stand before it; it works without a script."""
+    if len(table.rows) <= FOLDED_FROM:
+        return ""
+    name = html.escape(f"all-{table.name}")
+    return f"<input type=checkbox class=more id='{name}'><label for='{name}'>Show all {len(table.rows)} rows</label>"
+
+
 def _result_cell(cell: Cell) -> str:
     text = cell_html(cell.text)
     return f"<b>{text}</b>" if cell.best else text
@@ -134,9 +155,11 @@ _PAGE = """<!doctype html>
 <meta name="color-scheme" content="light dark">
 <title>{title}</title>
 <style>
-:root { --paper: #fff; --ink: #1b1f24; --muted: #5c666f; --rule: #e4e7ea; --card: #f6f8fa; --accent: #0072b2; }
+:root { --paper: #fff; --ink: #1b1f24; --muted: #5c666f; --rule: #e4e7ea; --card: #f6f8fa; --accent: #0072b2;
+  --shadow: rgb(0 0 0 / .22); }
 @media (prefers-color-scheme: dark) {
-  :root { --paper: #15181c; --ink: #e8eaed; --muted: #9aa3ad; --rule: #30363d; --card: #1c2127; --accent: #56b4e9; }
+  :root { --paper: #15181c; --ink: #e8eaed; --muted: #9aa3ad; --rule: #30363d; --card: #1c2127; --accent: #56b4e9;
+    --shadow: rgb(255 255 255 / .3); }
 }
 * { box-sizing: border-box; }
 body { margin: 0 auto; padding: 1.5rem 1rem 4rem; max-width: 60rem; background: var(--paper); color: var(--ink);
@@ -149,7 +172,9 @@ h2 { font-size: 1.15rem; margin: 2.5rem 0 .75rem; }
 .facts div { background: var(--card); border-radius: .5rem; padding: .6rem .8rem; }
 .facts dt { color: var(--muted); font-size: .8rem; }
 .facts dd { margin: 0; font-size: 1.1rem; font-weight: 600; overflow-wrap: anywhere; }
-.scroll { overflow-x: auto; -webkit-overflow-scrolling: touch; }
+.scroll { overflow-x: auto; -webkit-overflow-scrolling: touch; scrollbar-width: thin;
+  background: linear-gradient(to left, var(--paper) 30%, transparent) right / 2.5rem 100% no-repeat local,
+    linear-gradient(to left, var(--shadow), transparent) right / .9rem 100% no-repeat scroll; }
 table { border-collapse: collapse; width: 100%; font-size: .85rem; font-variant-numeric: tabular-nums; }
 th, td { padding: .45rem .6rem; text-align: right; white-space: nowrap; border-bottom: 1px solid var(--rule);
   vertical-align: top; }
@@ -160,8 +185,21 @@ td small { display: block; color: var(--muted); font-size: .75rem; font-weight: 
 tr.best td { font-weight: 650; }
 tr.best td:first-child { box-shadow: inset 3px 0 var(--accent); }
 table.typed th, table.typed td { text-align: right; }
+table.typed tr.best td { font-weight: inherit; }
+table.typed tr.best td:first-child { font-weight: 650; }
+tr.best td:first-child::after { content: "best"; margin-left: .5rem; padding: .05rem .4rem; border-radius: 1rem;
+  background: var(--accent); color: var(--paper); font-size: .7rem; font-weight: 600; vertical-align: .1em; }
 table.typed .words { text-align: left; }
 th.group { border-bottom: 2px solid var(--rule); text-align: center !important; }
+.more { position: absolute; opacity: 0; }
+.more + label { display: inline-block; margin: .25rem 0 .5rem; padding: .3rem .7rem; border: 1px solid var(--rule);
+  border-radius: .4rem; background: var(--card); font-size: .85rem; cursor: pointer; }
+.more:focus-visible + label { outline: 2px solid var(--accent); }
+.more:checked + label { color: var(--muted); }
+.more:not(:checked) ~ .scroll tbody tr:nth-child(n+16) { display: none; }
+.caution { margin: 1.25rem 0 0; padding: .6rem .9rem; border-left: 4px solid #e69f00; background: var(--card);
+  border-radius: .25rem; font-size: .9rem; }
+.caution ul { margin: .2rem 0 0; padding-left: 1.1rem; }
 button, select, input { font: inherit; color: inherit; background: var(--card); border: 1px solid var(--rule);
   border-radius: .4rem; padding: .35rem .8rem; }
 a { color: var(--accent); }
@@ -175,7 +213,8 @@ dl.commands dd { margin: .15rem 0 .9rem; padding: .5rem .7rem; background: var(-
 details { border-bottom: 1px solid var(--rule); padding: .5rem 0; }
 summary { cursor: pointer; }
 pre { overflow-x: auto; background: var(--card); border-radius: .4rem; padding: .75rem; }
-@media print { body { max-width: none; } figure, table { break-inside: avoid; } }
+@media print { .more ~ .scroll tbody tr:nth-child(n) { display: table-row; } body { max-width: none; }
+  figure, table { break-inside: avoid; } }
 </style>
 </head>
 <body>

@@ -15,6 +15,7 @@ from typing import Any
 from PIL import Image
 
 from rl2grid.analysis import figures
+from rl2grid.analysis.chart import Chart, chart_assets, chart_html
 from rl2grid.analysis.page import facts_html, figure_html, identities_html, write_page
 from rl2grid.analysis.section import Picture
 from rl2grid.drawing.theme import DARK, LIGHT
@@ -34,11 +35,12 @@ MadeBy = Callable[[Picture], str]
 
 @dataclass(frozen=True)
 class _Drawn:
-    """A figure as PNG."""
+    """A figure as PNG, or as a chart."""
 
     picture: Picture
-    light: bytes
-    dark: bytes
+    light: bytes = b""
+    dark: bytes = b""
+    chart: Chart | None = None
 
 
 class PageBuilder:
@@ -109,10 +111,7 @@ class PageBuilder:
             make_folder(folder)
         for picture in pictures:
             self._on_figure(picture.name)
-            light = picture.draw(LIGHT)
-            if folder is not None:
-                figures.save_figure(light, folder / picture.name)
-            self._drawn.append(_Drawn(picture, figures.png_bytes(light), figures.png_bytes(picture.draw(DARK))))
+            self._drawn.append(_drawn(picture, folder))
         self._made_by, self._heading, self._parts = made_by, heading, self._after
 
     def add_identities(self, identities: Sequence[tuple[str, Mapping[str, Any]]]) -> None:
@@ -121,9 +120,11 @@ class PageBuilder:
 
     def write(self, path: Path) -> int:
         """Write the page, whole or not at all, and return its size in bytes."""
-        others = sum(len(part.encode()) for part in (*self._before, *self._after))
+        charts = "".join(self._figure(one) for one in self._drawn if one.chart)
+        assets = [chart_assets()] if charts else []
+        others = sum(len(part.encode()) for part in (*self._before, *self._after, *assets, charts))
         drawn = _fitted(self._drawn, max(self._max_bytes - others, 0))
-        write_page(path, self._title, [*self._before, *self._figures(drawn), *self._after])
+        write_page(path, self._title, [*self._before, *self._figures(drawn), *self._after, *assets])
         return path.stat().st_size
 
     def _figures(self, drawn: Sequence[_Drawn]) -> list[str]:
@@ -145,7 +146,21 @@ class PageBuilder:
         return [f"<section><h2 id=figures>Figures</h2>{''.join(folded)}</section>"]
 
     def _figure(self, drawn: _Drawn) -> str:
+        if drawn.chart:
+            return chart_html(drawn.chart, drawn.picture.caption, self._made_by(drawn.picture))
         return figure_html(drawn.picture.caption, drawn.light, drawn.dark, self._made_by(drawn.picture))
+
+
+def _drawn(picture: Picture, folder: Path | None) -> _Drawn:
+    """A figure as the page shows it, also written to a folder if there is one."""
+    if folder is None and picture.chart:
+        return _Drawn(picture, chart=picture.chart())
+    light = picture.draw(LIGHT)
+    if folder is not None:
+        figures.save_figure(light, folder / picture.name)
+    if picture.chart:
+        return _Drawn(picture, chart=picture.chart())
+    return _Drawn(picture, figures.png_bytes(light), figures.png_bytes(picture.draw(DARK)))
 
 
 def _fitted(drawn: Sequence[_Drawn], max_bytes: int) -> Sequence[_Drawn]:
@@ -154,7 +169,10 @@ def _fitted(drawn: Sequence[_Drawn], max_bytes: int) -> Sequence[_Drawn]:
     fitting = drawn
     while sum(len(one.light) + len(one.dark) for one in fitting) * 4 / 3 > max_bytes and scale > SMALLEST:
         scale = max(0.8 * scale, SMALLEST)
-        fitting = [_Drawn(one.picture, _scaled(one.light, scale), _scaled(one.dark, scale)) for one in drawn]
+        fitting = [
+            one if one.chart else _Drawn(one.picture, _scaled(one.light, scale), _scaled(one.dark, scale))
+            for one in drawn
+        ]
     return fitting
 
 

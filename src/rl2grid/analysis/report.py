@@ -10,8 +10,9 @@ import html
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+from rl2grid.analysis.cautions import cautions
 from rl2grid.analysis.explorer import explorer_html
-from rl2grid.analysis.page import commands_html, result_table_html
+from rl2grid.analysis.page import cautions_html, commands_html, result_table_html
 from rl2grid.analysis.page_builder import MAX_BYTES, PageBuilder
 from rl2grid.analysis.result_tables import Methods, ranking, ranking_table
 from rl2grid.analysis.section import Section, plan_section
@@ -19,6 +20,11 @@ from rl2grid.records.collection import Collection
 from rl2grid.records.evaluations import Evaluation
 from rl2grid.records.methods import Method, method_label
 from rl2grid.records.trainings import TrainingRun
+
+UNFOLDED_TASKS = 4
+"""Tasks whose rankings stand one below the other; of more, all but the first are folded."""
+WIDEST = 12
+"""Columns of a table that fit a desk."""
 
 
 def write_report(
@@ -51,6 +57,7 @@ def write_report(
     page = PageBuilder(title, on_figure=on_figure, max_bytes=max_bytes)
     page.add_header(_facts(collection, section.methods), places=_menu(section.methods), style=_STYLE)
     page.add_section("What is missing", _missing(collection.missing))
+    page.add(cautions_html(cautions(section.methods)))
     page.add_section("Ranking", _rankings(section.methods, collection.evaluations), "ranking")
     page.add(*_tables(section))
     page.add_figures(section.pictures, lambda picture: _made_by(picture.task), heading=True)
@@ -87,11 +94,21 @@ def _missing(sentences: Sequence[str]) -> str:
 
 
 def _rankings(methods: Methods, results: Sequence[Evaluation]) -> str:
+    """A table for each task; of many tasks, all but the first are folded, with the best method to be seen."""
     parts = []
-    for task, group in methods.items():
-        links = [_method_links(method, results) for method in ranking(group)]
+    for number, (task, group) in enumerate(methods.items()):
+        ranked = ranking(group)
+        links = [_method_links(method, results) for method in ranked]
         short = html.escape(task.removeprefix("rl2grid/"))
-        parts.append(f"<h3>{short}</h3>{result_table_html(ranking_table(group), links=links)}")
+        table = result_table_html(ranking_table(group), links=links, best_first=True)
+        if len(methods) <= UNFOLDED_TASKS:
+            parts.append(f"<h3>{short}</h3>{table}")
+            continue
+        best = f"{html.escape(ranked[0].label)}, survival {ranked[0].scores('survival').values.mean():.3f}"
+        unfolded = " open" if number == 0 else ""
+        parts.append(
+            f"<details{unfolded}><summary><b>{short}</b> best of {len(ranked)}: {best}</summary>{table}</details>"
+        )
     return "".join(parts)
 
 
@@ -103,8 +120,12 @@ def _method_links(method: Method, results: Sequence[Evaluation]) -> str:
 def _tables(section: Section) -> list[str]:
     parts = []
     for table in section.tables:
+        # What does not fit in width stands in the overview the other way round.
+        if table.name.startswith("survival-") and len(table.columns) > WIDEST and len(section.methods) > 1:
+            continue
         heading = html.escape(table.name.replace("-", " ").capitalize())
-        parts.append(f"<section><h3>{heading}</h3>{result_table_html(table, made=_made_by(''))}</section>")
+        html_ = result_table_html(table, made=_made_by(""), best_first=table.name == "overview")
+        parts.append(f"<section><h3>{heading}</h3>{html_}</section>")
     return ["<h2 id=tables>Tables</h2>", *parts] if parts else []
 
 
@@ -166,5 +187,5 @@ nav { display: flex; flex-wrap: wrap; gap: .4rem 1.2rem; margin-top: 1.25rem; }
 h3 { font-size: 1rem; margin: 1.75rem 0 .5rem; }
 section > figure { max-width: 60rem; }
 td.links { max-width: 12rem; min-width: 4rem; white-space: normal; }
-@media (max-width: 40rem) { td:first-child { min-width: 5.5rem; white-space: normal; } }
+@media (max-width: 40rem) { .scroll td:first-child { min-width: 5.5rem; white-space: normal; } }
 """

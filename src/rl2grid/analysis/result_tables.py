@@ -21,6 +21,7 @@ from rl2grid.mdp.termination import GAME_OVER_TEXT, GameOver
 from rl2grid.records.methods import COSTS, Method, interval_words
 from rl2grid.records.statistics import (
     Aggregate,
+    Estimate,
     estimate,
     iqm_score,
     mean_score,
@@ -47,8 +48,11 @@ Methods = Mapping[str, Sequence[Method]]
 
 
 def result_tables(methods: Methods) -> tuple[ResultTable, ...]:
-    """Every table that the results allow."""
+    """Every table that the results allow; methods of a task are in the order of its ranking."""
     tables = [survival_table(methods, kind) for kind in ("T", "R") if _tasks(methods, kind)]
+    methods = {task: ranking(group) for task, group in methods.items()}
+    if len(methods) > 1 and any(len(group) > 1 for group in methods.values()):
+        tables.insert(0, overview_table(methods))
     tables += [aggregate_table(methods), constraint_table(methods), score_table(methods), ending_table(methods)]
     if any(len(group) > 1 for group in methods.values()):
         tables.append(comparison_table(methods))
@@ -119,6 +123,42 @@ def _ranking_table(
     )
     columns = (*name_columns, *(Column(heading) for heading in headings))
     return ResultTable(f"ranking-{_task_name(ranked[0])}", caption, columns, tuple(rows))
+
+
+def overview_table(methods: Methods) -> ResultTable:
+    """Methods in rows and tasks in columns: mean survival, the best of a task in bold, by the mean place.
+
+    Args:
+        methods: by task, each in the order of its ranking.
+    """
+    places: dict[str, list[int]] = {}
+    found: dict[tuple[str, str], Estimate] = {}
+    for task, group in methods.items():
+        for place, method in enumerate(group, start=1):
+            places.setdefault(method.label, []).append(place)
+            found[method.label, task] = estimate(method.scores("survival"))
+    best = {
+        task: _printed_best([value.value for (_, other), value in found.items() if other == task], 2)
+        for task in methods
+    }
+    # Who was played on all tasks stands before who was not: a mean of other tasks is no order.
+    mean = {label: sum(own) / len(own) for label, own in places.items()}
+    ordered = sorted(places, key=lambda label: (-len(places[label]), mean[label]))
+    rows = []
+    for label in ordered:
+        cells = [
+            MISSING
+            if (label, task) not in found
+            else mean_cell(found[label, task], best=round(found[label, task].value, 2) == best[task])
+            for task in methods
+        ]
+        rows.append((Cell(label), Cell(f"{mean[label]:.1f}"), *cells))
+    columns = (Column("Method", words=True), Column("Mean place"), *(Column(short_id(task)) for task in methods))
+    caption = (
+        "Mean survival on every task, plus or minus half of its interval; the best of a task in bold. Mean place: in "
+        f"the rankings of the tasks that a method was played on. {_intervals(methods, methods)}."
+    )
+    return ResultTable("overview", caption, columns, tuple(rows))
 
 
 def survival_table(methods: Methods, kind: str) -> ResultTable:

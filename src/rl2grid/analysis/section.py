@@ -18,11 +18,13 @@ from matplotlib.figure import Figure
 
 from rl2grid.analysis import comparison_figures as compare
 from rl2grid.analysis import figures
-from rl2grid.analysis.curves import SMOOTHED_EPISODES
+from rl2grid.analysis.cautions import cautions
+from rl2grid.analysis.chart import Chart, lifetime_chart, profile_chart, training_chart
+from rl2grid.analysis.curves import MOST_LINES, SMOOTHED_EPISODES
 from rl2grid.analysis.ending_figures import draw_ending_bars, draw_ending_map
-from rl2grid.analysis.result_tables import Methods, result_tables
+from rl2grid.analysis.result_tables import Methods, ranking, result_tables
 from rl2grid.analysis.table import WRITERS, ResultTable
-from rl2grid.analysis.training_figures import COST_PANELS, SCORE_PANELS, draw_panels, logs
+from rl2grid.analysis.training_figures import COST_PANELS, SCORE_PANELS, SURVIVAL_PANELS, draw_panels, logs
 from rl2grid.drawing.theme import LIGHT, Theme
 from rl2grid.envs.tasks import short_id
 from rl2grid.errors import UsageError
@@ -32,6 +34,9 @@ from rl2grid.records.methods import Method, group_methods
 from rl2grid.records.trainings import TrainingCurve, TrainingRun, group_curves
 
 INDEX_FILE, TABLES_FOLDER, FIGURES_FOLDER = "index.md", "tables", "figures"
+
+ENDINGS_DRAWN = 4
+"""Methods whose endings are drawn where there are more than can be told apart."""
 
 CurvesByTask = Mapping[str, Mapping[str, Sequence[TrainingCurve]]]
 """By id of the task, then label."""
@@ -47,6 +52,8 @@ class Picture:
     draw: Callable[[Theme], Figure]
     task: str = ""
     """Id of the task that it is about; empty where it is about several."""
+    chart: Callable[[], Chart] | None = None
+    """The same to be read in a browser; None: there is nothing to read that is not seen."""
 
 
 @dataclass(frozen=True)
@@ -126,6 +133,9 @@ def training_pictures(curves: CurvesByTask) -> Iterator[Picture]:
                 runs, theme=theme, title=f"Survival in training: {short}"
             ),
             task,
+            lambda group=group, short=short: training_chart(  # type: ignore[misc]
+                group, SURVIVAL_PANELS, title=f"Survival in training: {short}"
+            ),
         )
         for name, panels, words in (
             ("scores", SCORE_PANELS, "Operational scores"),
@@ -139,6 +149,9 @@ def training_pictures(curves: CurvesByTask) -> Iterator[Picture]:
                         group, panels, title=title, theme=theme
                     ),
                     task,
+                    lambda group=group, panels=panels, title=f"{words}: {short}": training_chart(  # type: ignore[misc]
+                        group, panels, title=title
+                    ),
                 )
 
 
@@ -152,22 +165,26 @@ def evaluation_pictures(methods: Methods) -> Iterator[Picture]:
 
 
 def _task_pictures(short: str, group: tuple[Method, ...]) -> Iterator[Picture]:
-    yield _of_methods("aggregates", short, group, "Mean, median, IQM and optimality gap on", compare.draw_aggregates)
-    yield _of_methods(
+    ranked = tuple(ranking(group))
+    yield _of_methods("aggregates", short, ranked, "Mean, median, IQM and optimality gap on", compare.draw_aggregates)
+    profiles = _of_methods(
         "profiles", short, group, "Share of episodes that survive beyond each share on", compare.draw_profiles
     )
-    yield _of_methods("lifetimes", short, group, "Share of grids alive over time on", compare.draw_lifetimes)
-    yield _of_methods("costs", short, group, "Costs against their thresholds on", compare.draw_costs)
+    yield replace(profiles, chart=lambda: profile_chart(group, title=f"Performance profiles: {short}"))
+    alive = _of_methods("lifetimes", short, group, "Share of grids alive over time on", compare.draw_lifetimes)
+    yield replace(alive, chart=lambda: lifetime_chart(group, title=f"Time to failure: {short}"))
+    yield _of_methods("costs", short, ranked, "Costs against their thresholds on", compare.draw_costs)
     yield _of_methods("months", short, group, "Survival by method and month on", compare.draw_scenarios)
     if len(group) > 1:
-        yield _of_methods("improvements", short, group, "Probability of improvement on", compare.draw_improvements)
+        yield _of_methods("improvements", short, ranked, "Probability of improvement on", compare.draw_improvements)
         pair = compare.best_pair(group)
         caption = f"The two methods that survive longest on {short}, month by month."
         yield Picture(f"best-two-{short}", caption, lambda theme: compare.draw_two_methods(*pair, theme=theme))
     if compare.varied(group):
         chosen = compare.varied(group)
         yield _of_methods("heuristics", short, chosen, "Survival by heuristic on", compare.draw_heuristics)
-    for method in group:
+    # Of many methods, maps of the best: nobody looks at forty.
+    for method in ranked if len(ranked) <= MOST_LINES else ranked[:ENDINGS_DRAWN]:
         if not all(episode.completed for episode in method.episodes):
             yield from _ending_pictures(short, method)
 
@@ -218,6 +235,8 @@ def _index(section: Section, results: Sequence[Evaluation], runs: Sequence[Train
     lines = ["# Results", ""]
     if command:
         lines += ["Everything here was made by", "", f"    {command}", ""]
+    mind = cautions(section.methods)
+    lines += ["## Mind", "", *(f"- {sentence}" for sentence in mind), ""] if mind else []
     lines += ["## Tables", ""] if section.tables else []
     for table in section.tables:
         links = ", ".join(f"[{suffix}]({TABLES_FOLDER}/{table.name}.{suffix})" for suffix in WRITERS)

@@ -26,6 +26,7 @@ class Panel(NamedTuple):
     """Of a cost."""
 
 
+SURVIVAL_PANELS = (Panel(SURVIVAL, "Share of the episode survived"),)
 SCORE_PANELS = (
     Panel("charts/score_margin", "Margin (higher: more room)"),
     Panel("charts/score_overload", "Overload (0: none)"),
