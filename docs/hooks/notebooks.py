@@ -41,9 +41,15 @@ def _cell(cell: dict[str, Any]) -> str:
 
 def _output(output: dict[str, Any]) -> str:
     if output["output_type"] == "stream":
-        return f"```text\n{''.join(output['text']).rstrip()}\n```"
+        return _printed("".join(output["text"]).rstrip())
     data = output.get("data", {})
     if "image/png" in data:
         picture = "".join(data["image/png"]).strip()
         return f'<img alt="figure drawn by the code above" src="data:image/png;base64,{picture}">'
-    return f"```text\n{''.join(data['text/plain'])}\n```" if "text/plain" in data else ""
+    return _printed("".join(data["text/plain"])) if "text/plain" in data else ""
+
+
+def _printed(text: str) -> str:
+    """What was printed; columns stay below each other, and scroll, anything else is wrapped."""
+    aligned = any("  " in line.strip() for line in text.splitlines())
+    return f"```{{.text{' .aligned' if aligned else ''}}}\n{text}\n```"

@@ -1,27 +1,27 @@
 """The page of the tasks: its tables and pictures are made from the package while the site is built.
 
 ``docs/tasks.md`` names what is to be put in, with ``<!-- tasks: overview -->``, ``<!-- tasks: keywords -->`` and
-``<!-- tasks: <grid> -->``.
+``<!-- tasks: <grid> -->``. ``docs/index.md`` has one of the pictures, ``<!-- grid: <grid> -->``.
 """
 
 from __future__ import annotations
 
-import io
 import json
 import re
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import matplotlib
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from mkdocs.config.defaults import MkDocsConfig
-from mkdocs.structure.files import File, Files
+from mkdocs.structure.files import Files
 from mkdocs.structure.pages import Page
+from pictures import add_picture, picture_markdown
 
 from rl2grid.drawing.grid_drawing import GridDrawing, Scene, reference_scene
-from rl2grid.drawing.theme import DARK, LIGHT, Theme, style
+from rl2grid.drawing.theme import Theme, style
 from rl2grid.envs.options import option_texts, options_without
 from rl2grid.envs.tasks import all_tasks
 from rl2grid.grids import GRID_IDS, Grid, load_grid
@@ -30,10 +30,9 @@ from rl2grid.mdp.actions import continuous_layout
 from rl2grid.mdp.features import observation_size
 
 RESULTS = Path(__file__).resolve().parents[2] / "benchmarks" / "results" / "tasks.json"
-THEMES = (LIGHT, DARK)
 PRACTICALLY_NEVER = 10.0
 """Loading that no line reaches while a power flow exists: the 36-bus grids' hard limit of 200 says "none"."""
-_MARK = re.compile(r"<!-- tasks: (\S+) -->")
+_MARK = re.compile(r"<!-- (tasks|grid): (\S+) -->")
 _OPPONENTS = {"none": "none", "weighted": "weighted", "geometric": "geometric", "multi_area": "multi-area"}
 
 
@@ -43,29 +42,27 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for grid_id in GRID_IDS:
         grid = load_grid(grid_id)
         scene = _scene(grid, results[grid_id]["moment"])
-        for theme in THEMES:
-            files.append(File.generated(config, _picture(grid_id, theme), content=_drawn(grid, scene, theme)))
+        add_picture(files, config, f"grids/{grid_id}", partial(_drawn, grid, scene))
     return files
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Put the tables and pictures where the page asks for them."""
-    if page.file.src_uri != "tasks.md":
+    if page.file.src_uri not in ("tasks.md", "index.md"):
         return markdown
     results = json.loads(RESULTS.read_text(encoding="utf-8"))
 
     def fill(mark: re.Match[str]) -> str:
-        if mark[1] == "keywords":
+        kind, name = mark.groups()
+        if kind == "grid":
+            return _captioned(name, results[name])
+        if name == "keywords":
             return _keywords()
-        if mark[1] == "overview":
+        if name == "overview":
             return _overview(results)
-        return _of_grid(load_grid(mark[1]), results[mark[1]])
+        return _of_grid(load_grid(name), results[name])
 
     return _MARK.sub(fill, markdown)
-
-
-def _picture(grid_id: str, theme: Theme) -> str:
-    return f"assets/grids/{grid_id}-{theme.name}.png"
 
 
 def _scene(grid: Grid, moment: dict[str, Any]) -> Scene:
@@ -82,14 +79,11 @@ def _scene(grid: Grid, moment: dict[str, Any]) -> Scene:
     )
 
 
-def _drawn(grid: Grid, scene: Scene, theme: Theme) -> bytes:
+def _drawn(grid: Grid, scene: Scene, theme: Theme) -> Figure:
     with matplotlib.rc_context(style(theme)):
-        figure = Figure(figsize=(11, 6.2), dpi=120)
-        FigureCanvasAgg(figure)
+        figure = Figure(figsize=(11, 6.2))
         GridDrawing(grid, figure.add_axes((0.01, 0.01, 0.98, 0.98)), theme=theme).show(scene)
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format="png")
-    return buffer.getvalue()
+    return figure
 
 
 def _overview(results: dict[str, Any]) -> str:
@@ -117,12 +111,14 @@ def _keywords() -> str:
 
 
 def _of_grid(grid: Grid, result: dict[str, Any]) -> str:
+    return f"{_captioned(grid.id, result)}\n\n{_facts(grid, result)}\n\n{_tasks(grid)}"
+
+
+def _captioned(grid_id: str, result: dict[str, Any]) -> str:
+    """The picture of a grid, and what it shows."""
     moment = result["moment"]
     caption = f"Step {moment['step']:,} of validation month `{moment['scenario']}`: the first emergency."
-    pictures = "".join(
-        f"![{grid.id}]({_picture(grid.id, theme)}#only-{'dark' if theme is DARK else 'light'})" for theme in THEMES
-    )
-    return f"{pictures}\n\n*{caption}*\n\n{_facts(grid, result)}\n\n{_tasks(grid)}"
+    return f"{picture_markdown(f'grids/{grid_id}', grid_id)}\n\n*{caption}*"
 
 
 def _facts(grid: Grid, result: dict[str, Any]) -> str:

@@ -102,7 +102,7 @@ def test_the_figure_has_a_line_per_configuration_the_longest_lived_on_top():
         untrained("do-nothing", [0.1, 0.2]), trained(1, [0.6, 0.8]), trained(2, [0.6, 0.9]), untrained("greedy", [1, 1])
     )
     (axes,) = draw_ledger(results, TASK).axes
-    names = [label.get_text() for label in axes.get_yticklabels()]
+    names = [label.get_text().replace("\n", " ") for label in axes.get_yticklabels()]
     assert names == ["do-nothing", "ppo + idle (1,000 decisions, 2 seeds)", "greedy"]
     points = [line.get_xdata()[0] for line in axes.lines if line.get_marker() == "o"]
     assert points == pytest.approx([0.15, 0.725, 1.0])

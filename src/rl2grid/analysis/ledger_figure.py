@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import PercentFormatter
 
+from rl2grid.analysis.figures import wrapped_label
 from rl2grid.analysis.ledger_table import LedgerRow, ledger_rows
 from rl2grid.drawing.theme import LIGHT, Theme, style
 from rl2grid.envs.tasks import short_id
@@ -31,8 +32,10 @@ def draw_ledger(results: Mapping[str, HashedTest], task: str, *, theme: Theme = 
     if not rows:
         raise ValueError(f"The ledger has no result of {task}.")
     found = sorted(((estimate(row.scores("survival")), row) for row in rows), key=lambda one: one[0].value)
-    with matplotlib.rc_context(style(theme)):
-        figure = Figure(figsize=(8.4, 1.5 + 0.3 * len(rows)), layout="constrained")
+    # Letters that can be read on a phone, where the figure is three inches wide.
+    letters = dict.fromkeys(("xtick.labelsize", "ytick.labelsize", "axes.labelsize", "legend.fontsize"), 10.5)
+    with matplotlib.rc_context({**style(theme), **letters}):
+        figure = Figure(figsize=(6.2, 1.3 + 0.32 * len(rows)), layout="constrained")
         axes = figure.subplots()
         for place, (survival, row) in enumerate(found):
             colour = theme.series[int(bool(row.first.training))]
@@ -41,7 +44,7 @@ def draw_ledger(results: Mapping[str, HashedTest], task: str, *, theme: Theme = 
             if row.first.training and len(row.results) > 1:
                 each = [one.test["survival"][0] for one in row.results]
                 axes.plot(each, [place] * len(each), linestyle="", marker="|", color=colour, markersize=9)
-        axes.set_yticks(range(len(found)), [_name(row) for _, row in found])
+        axes.set_yticks(range(len(found)), [wrapped_label(_name(row)) for _, row in found])
         axes.set(xlim=(0, 1.01), ylim=(-0.6, len(found) - 0.4), xlabel="Share of the month survived")
         axes.xaxis.set_major_formatter(PercentFormatter(1.0))
         axes.grid(axis="x")

@@ -103,6 +103,35 @@ def ledger_table(results: Mapping[str, HashedTest], task: str | None = None, ref
     return "\n".join([*lines, "", LEGEND.format(heading=heading.capitalize())])
 
 
+def short_ledger_table(results: Mapping[str, HashedTest], task: str) -> str:
+    """The results of one task in few columns, as Markdown: the best first, which is bold.
+
+    Args:
+        results: of a ledger.
+        task: id of the task.
+    """
+    rows = ledger_rows({digest: one for digest, one in results.items() if one.task == task}, results)
+    compared = _compared(rows, REFERENCE)
+    heading = f"to {REFERENCE}"
+    ranked = sorted(enumerate(rows), key=lambda one: -float(one[1].scores("survival").values.mean()))
+    columns: dict[str, list[str]] = {name: [] for name in ("agent", "survival", heading, "completed", "TLO safe")}
+    for place, (number, row) in enumerate(ranked):
+        survival = with_interval(estimate(row.scores("survival")), 3)
+        difference = compared.get(number)
+        cells = (
+            f"**{row.first.label}**" if place == 0 else row.first.label,
+            f"**{survival}**" if place == 0 else survival,
+            difference_cell(difference).text if isinstance(difference, Difference) else difference or "",
+            share_text(estimate(row.scores("completed"))),
+            share_text(estimate(row.safe("TLO"))),
+        )
+        for column, cell in zip(columns.values(), cells, strict=True):
+            column.append(cell)
+    shown = {name: cells for name, cells in columns.items() if any(cells)}
+    lines = [markdown_row(list(shown)), "|" + ":--|" + "--:|" * (len(shown) - 1)]
+    return "\n".join([*lines, *(markdown_row(cells) for cells in zip(*shown.values(), strict=True))])
+
+
 def ledger_rows(shown: Mapping[str, HashedTest], results: Mapping[str, HashedTest]) -> list[LedgerRow]:
     """Rows in the order of the table.
 

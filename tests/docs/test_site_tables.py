@@ -1,0 +1,68 @@
+"""Tables of the site can be read on a phone, and the first page says what the ledger holds."""
+
+import importlib
+import json
+import sys
+
+import pytest
+
+pytest.importorskip("mkdocs")
+
+from documentation import ROOT
+
+from rl2grid.analysis.ledger_table import ledger_rows, short_ledger_table
+from rl2grid.envs.tasks import find_task
+from rl2grid.records.ledger import read_ledger
+from rl2grid.records.statistics import estimate
+
+LEDGER = ROOT / "benchmarks" / "results" / "baselines.json"
+
+
+@pytest.fixture
+def tables(monkeypatch):
+    monkeypatch.setattr(sys, "path", [str(ROOT / "docs" / "hooks"), *sys.path])
+    return importlib.import_module("tables")
+
+
+def table(headings, *rows):
+    head = "".join(f"<th>{heading}</th>\n" for heading in headings)
+    body = "".join("<tr>\n" + "".join(f"<td>{cell}</td>\n" for cell in row) + "</tr>\n" for row in rows)
+    return f"<table>\n<thead>\n<tr>\n{head}</tr>\n</thead>\n<tbody>\n{body}</tbody>\n</table>"
+
+
+def test_cells_of_wide_tables_are_told_their_headings(tables):
+    wide = table(("a", "<code>b</code> &lt; c", "d", "e"), ("1", "2", "", "4"))
+    named = tables.named_cells(wide)
+    assert named.startswith('<table data-cards="">')
+    for cell in ('<td data-heading="a">1</td>', '<td data-heading="b &lt; c">2</td>', '<td data-heading="e">4</td>'):
+        assert cell in named
+
+
+def test_narrow_tables_stay_and_empty_headings_go(tables):
+    narrow = table(("a", "b"), ("1", "2"))
+    assert tables.named_cells(narrow) == narrow
+    assert "<thead>" not in tables.named_cells(table(("", ""), ("1", "2")))
+
+
+def test_a_short_table_has_the_best_first():
+    lines = short_ledger_table(read_ledger(LEDGER), find_task("bus14-T0").id).splitlines()
+    assert lines[0].startswith("| agent | survival | to do-nothing |")
+    assert "**" in lines[2]
+    survivals = [float(line.split("|")[2].strip(" *").split()[0]) for line in lines[2:]]
+    assert survivals == sorted(survivals, reverse=True)
+    assert "to do-nothing" not in short_ledger_table(read_ledger(LEDGER), find_task("bus36-MO-v0-T1").id)
+
+
+def test_the_first_page_says_what_was_measured():
+    results = read_ledger(LEDGER)
+
+    def best(task):
+        rows = ledger_rows({k: one for k, one in results.items() if one.task == find_task(task).id}, results)
+        return max(estimate(row.scores("survival")).value for row in rows)
+
+    page = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
+    assert f"**{best('bus14-T0'):.1%}** of a month" in page
+    assert f"**{best('bus36-MO-v0-T1'):.0%}** by the same search" in page
+    corrections = json.loads((ROOT / "benchmarks" / "results" / "corrections.json").read_text(encoding="utf-8"))
+    learned = [row["after"][0] for row in corrections["rows"] if row["setting"][1] == find_task("bus14-T0").id]
+    assert f"**{100 * min(learned):.0f} to {max(learned):.0%}** there" in page
