@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,8 +22,10 @@ from rl2grid.analysis.chart import (
     training_chart,
 )
 from rl2grid.analysis.curves import lifetime_lines
+from rl2grid.analysis.section import plan_section
 from rl2grid.analysis.training_figures import COST_PANELS, SURVIVAL_PANELS
 from rl2grid.records.methods import group_methods
+from rl2grid.records.trainings import TrainingRun
 
 METHODS = group_methods(
     [
@@ -74,6 +77,17 @@ def test_of_many_methods_the_best_are_switched_on():
     assert len(data["first"]) == FIRST_SHOWN
     ends = {line["label"]: line["y"][-1] for line in panel["lines"]}
     assert min(ends[label] for label in data["first"]) >= max(v for k, v in ends.items() if k not in data["first"])
+
+
+def test_a_method_has_one_colour_in_training_and_in_evaluations():
+    results = [result("do-nothing", [[0.1]] * 3), result("ppo", [[0.9]] * 3), result("dqn", [[0.5]] * 3)]
+    runs = [TrainingRun(Path(f"runs/{label}"), TASK, {}, 1, curve(label)) for label in ("dqn", "ppo")]
+    charts = {one.name: one.chart for one in plan_section(results, runs).pictures if one.chart}
+    looks = [
+        {line["label"]: line["look"] for line in chart_data(charts[f"{name}-bus14-T0"]())["panels"][0]["lines"]}
+        for name in ("training", "profiles", "lifetimes")
+    ]
+    assert looks[1] == looks[2] == {**looks[0], "do-nothing": 2}
 
 
 def test_text_of_strangers_stays_text():

@@ -6,12 +6,14 @@ import html
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 from sample_results import TASK, curve, result
 from test_demo_report import Page
 
-from rl2grid.analysis import page_builder, section
+from rl2grid.analysis import comparison_table, page, page_builder, report, section
 from rl2grid.analysis.report import write_report
+from rl2grid.envs.tasks import all_tasks
 from rl2grid.errors import UsageError
 from rl2grid.records.collection import Collection
 from rl2grid.records.trainings import TrainingRun
@@ -117,3 +119,58 @@ def test_results_that_do_not_belong_together_make_no_page(tmp_path):
     with pytest.raises(UsageError, match="nothing to analyse"):
         write(tmp_path, Collection())
     assert not list(tmp_path.iterdir())
+
+
+def study(agents: int, tasks: int, seeds: int, months: int = 3) -> Collection:
+    """A made-up study: every agent on every task, trained with every seed."""
+    random = np.random.default_rng(0)
+    names = [name for name in all_tasks() if "-LSI" not in name and "-TLO" not in name][:tasks]
+    evaluations = []
+    for task in names:
+        for agent in range(agents):
+            for seed in range(seeds):
+                survivals = random.uniform(0, 0.9, (months, 1)).round(2).tolist()
+                trained = {"trained_with": {"algorithm": f"agent-{agent}", "seed": seed}}
+                evaluations.append(
+                    result(f"agent-{agent}", survivals, task=task, agent_hash=f"{agent}-{seed}", agent_identity=trained)
+                )
+    return Collection(evaluations)
+
+
+@pytest.mark.parametrize(("agents", "tasks", "seeds"), [(4, 3, 1), pytest.param(40, 12, 5, marks=pytest.mark.slow)])
+def test_large_studies_stay_readable(tmp_path, monkeypatch, agents, tasks, seeds):
+    monkeypatch.setattr(section, "evaluation_pictures", lambda methods: [])
+    if agents < 40:
+        # What is large is less, so that the test is short.
+        monkeypatch.setattr(page, "FOLDED_FROM", 3)
+        monkeypatch.setattr(report, "UNFOLDED_TASKS", 2)
+        monkeypatch.setattr(report, "WIDEST", 3)
+        monkeypatch.setattr(comparison_table, "MOST_COMPARED", 3)
+    collection = study(agents, tasks, seeds)
+    text = write(tmp_path, collection)
+    ranking = text[text.index("id=ranking") : text.index("id=tables")]
+    assert ranking.count("<details") == tasks
+    assert ranking.count("<details open>") == 1
+    assert ranking.count("<tr class=best>") == tasks
+    tables = text[text.index("id=tables") : text.index("id=episodes")]
+    assert tables.index("<h3>Overview</h3>") < tables.index("<h3>Aggregates</h3>")
+    assert "<h3>Survival topology</h3>" not in tables  # has as many columns as there are agents
+    bodies = re.findall(r"<tbody>(.*?)</tbody>", tables)
+    rows = [body.count("<tr") for body in bodies]
+    assert rows[0] == agents
+    assert rows[-1] == (agents - 1) * tasks  # pairs with the first of each task
+    assert tables.count("class=more") == sum(n > page.FOLDED_FROM for n in rows)
+    assert ranking.count("class=more") == tasks
+    assert all(f"agent-{agent}" in ranking for agent in range(agents))
+    assert "3 months are too few" in text
+
+
+def test_the_overview_is_in_the_order_of_the_mean_place():
+    (overview, *_) = section.plan_section(study(3, 2, 1).evaluations).tables
+    assert [column.heading for column in overview.columns] == ["Method", "Mean place", "bus14-T0", "bus14-T1"]
+    places = [float(row[1].text) for row in overview.rows]
+    assert places == sorted(places)
+    assert sum(places) == pytest.approx(6)
+    for column in (2, 3):
+        values = {row[column].text: row[column].best for row in overview.rows}
+        assert [text for text, best in values.items() if best] == [max(values)]

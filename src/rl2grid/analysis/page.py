@@ -21,7 +21,8 @@ FOLDED_FROM = 15
 
 def write_page(path: Path, title: str, parts: Sequence[str]) -> None:
     """Write one HTML page that needs no other file, in the place of an earlier one; ``parts`` are HTML."""
-    write_text(path, filled(_PAGE, title=html.escape(printable(title)), body="\n".join(parts)))
+    page = filled(_PAGE, title=html.escape(printable(title)), body="\n".join(parts), first_folded=str(FOLDED_FROM + 1))
+    write_text(path, page)
 
 
 def filled(template: str, **parts: str) -> str:
@@ -196,7 +197,7 @@ th.group { border-bottom: 2px solid var(--rule); text-align: center !important; 
   border-radius: .4rem; background: var(--card); font-size: .85rem; cursor: pointer; }
 .more:focus-visible + label { outline: 2px solid var(--accent); }
 .more:checked + label { color: var(--muted); }
-.more:not(:checked) ~ .scroll tbody tr:nth-child(n+16) { display: none; }
+.more:not(:checked) ~ .scroll tbody tr:nth-child(n+{first_folded}) { display: none; }
 .caution { margin: 1.25rem 0 0; padding: .6rem .9rem; border-left: 4px solid #e69f00; background: var(--card);
   border-radius: .25rem; font-size: .9rem; }
 .caution ul { margin: .2rem 0 0; padding-left: 1.1rem; }

@@ -79,7 +79,9 @@ def plan_section(results: Sequence[Evaluation], runs: Sequence[TrainingRun] = ()
     if not results and not runs:
         raise UsageError("There is nothing to analyse: give at least one evaluation or training run.")
     methods = group_methods(results) if results else {}
-    pictures = [*training_pictures(group_curves(runs)), *evaluation_pictures(methods)]
+    curves = group_curves(runs)
+    drawn = {task: _trained_first(group, list(curves.get(task, ()))) for task, group in methods.items()}
+    pictures = [*training_pictures(curves), *evaluation_pictures(drawn)]
     return Section(methods, result_tables(methods) if methods else (), tuple(_distinct(pictures)))
 
 
@@ -162,6 +164,12 @@ def evaluation_pictures(methods: Methods) -> Iterator[Picture]:
             yield replace(picture, task=task)
     for grid, group in _by_grid(methods).items():
         yield _of_methods("levels", grid, group, "Survival on the levels of difficulty of", compare.draw_levels)
+
+
+def _trained_first(methods: Sequence[Method], trained: Sequence[str]) -> tuple[Method, ...]:
+    """The methods in the order of their training curves, so that a method has one colour in both."""
+    places = {label: place for place, label in enumerate(trained)}
+    return tuple(sorted(methods, key=lambda method: places.get(method.label, len(places))))
 
 
 def _task_pictures(short: str, group: tuple[Method, ...]) -> Iterator[Picture]:

@@ -38,6 +38,7 @@ def _run(options: argparse.Namespace, output: Output) -> int:
     results, runs = collection.evaluations, collection.runs
     try:
         from rl2grid.analysis import section
+        from rl2grid.analysis.cautions import cautions
         from rl2grid.drawing import theme as themes
     except ImportError as error:
         raise UsageError(f"Figures need {error.name}: install it with `pip install rl2grid[analysis]`.") from None
@@ -55,7 +56,7 @@ def _run(options: argparse.Namespace, output: Output) -> int:
             on_file=lambda name: bar.update(task, advance=1, description=name),
             plan=plan,
         )
-    for sentence in collection.missing:
+    for sentence in (*collection.missing, *cautions(plan.methods)):
         output.remark(sentence)
     output.results(index=index, tables=len(plan.tables), figures=len(plan.pictures), missing=collection.missing)
     output.remark(f"{len(plan.tables)} tables and {len(plan.pictures)} figures, listed in {index}.")

@@ -40,6 +40,7 @@ def _run(options: argparse.Namespace, output: Output) -> int:
     collection = collect(options.folders, options.split)
     try:
         from rl2grid.analysis import section
+        from rl2grid.analysis.cautions import cautions
         from rl2grid.analysis.report import write_report
     except ImportError as error:
         raise UsageError(f"Reports need {error.name}: install it with `pip install rl2grid[analysis]`.") from None
@@ -60,7 +61,7 @@ def _run(options: argparse.Namespace, output: Output) -> int:
             on_figure=lambda name: bar.update(task, advance=1, description=name),
             plan=plan,
         )
-    for sentence in collection.missing:
+    for sentence in (*collection.missing, *cautions(plan.methods)):
         output.remark(sentence)
     episodes = sum(len(result.episodes) for result in collection.evaluations)
     output.results(page=path, figures=number, episodes=episodes, missing=collection.missing)
