@@ -1,6 +1,6 @@
 """Tables that fit a phone: every cell is told its heading, so that a row can be shown as a card (``assets/site.css``).
 
-Tables of up to three columns fit as they are. A table whose headings are all empty loses them.
+Tables of two columns fit as they are. A table whose headings are all empty loses them.
 """
 
 from __future__ import annotations
@@ -12,8 +12,10 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import Files
 from mkdocs.structure.pages import Page
 
-FITTING = 3
+FITTING = 2
 """Columns that fit a phone."""
+LONG = 36
+"""Letters of a cell from which on it stands below its heading, and not beside it."""
 _TABLE = re.compile(r"<table>.*?</table>", re.DOTALL)
 _HEAD = re.compile(r"<thead>.*?</thead>\s*", re.DOTALL)
 _HEADING = re.compile(r"<th\b[^>]*>(.*?)</th>", re.DOTALL)
@@ -41,4 +43,9 @@ def named_cells(table: str) -> str:
 
 def _named(row: str, headings: list[str]) -> str:
     names = iter(headings)
-    return _CELL.sub(lambda cell: f'<td{cell[1]} data-heading="{next(names, "")}">{cell[2]}</td>', row)
+
+    def named(cell: re.Match[str]) -> str:
+        long = ' data-long=""' if len(_TAG.sub("", cell[2])) >= LONG else ""
+        return f'<td{cell[1]} data-heading="{next(names, "")}"{long}>{cell[2]}</td>'
+
+    return _CELL.sub(named, row)

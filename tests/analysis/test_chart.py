@@ -13,6 +13,7 @@ from sample_results import TASK, curve, result
 from rl2grid.analysis import comparison_figures as compare
 from rl2grid.analysis.chart import (
     FIRST_SHOWN,
+    LOOKS,
     MOST_POINTS,
     chart_assets,
     chart_data,
@@ -69,12 +70,15 @@ def test_a_long_staircase_is_thinned_and_stays_exact_where_it_is_read():
         assert any(y == pytest.approx(line.y[k], rel=1e-3, abs=1e-9) for k in near)
 
 
-def test_of_many_methods_the_best_are_switched_on():
-    curves = {f"agent {k}": [curve(f"agent {k}", k)] for k in range(FIRST_SHOWN + 5)}
+@pytest.mark.parametrize("number", [FIRST_SHOWN + 5, LOOKS + 5])
+def test_of_many_methods_the_best_are_switched_on_and_look_different(number):
+    curves = {f"agent {k}": [curve(f"agent {k}", k)] for k in range(number)}
     data = chart_data(training_chart(curves, SURVIVAL_PANELS, title="Training"))
     (panel,) = data["panels"]
     assert len(panel["lines"]) == len(curves)
     assert len(data["first"]) == FIRST_SHOWN
+    looks = {line["look"] % LOOKS for line in panel["lines"] if line["label"] in data["first"]}
+    assert len(looks) == FIRST_SHOWN
     ends = {line["label"]: line["y"][-1] for line in panel["lines"]}
     assert min(ends[label] for label in data["first"]) >= max(v for k, v in ends.items() if k not in data["first"])
 

@@ -22,6 +22,7 @@ from rl2grid.analysis.curves import (
     profile_lines,
     training_lines,
 )
+from rl2grid.analysis.figures import DASHES
 from rl2grid.analysis.page import embedded
 from rl2grid.analysis.training_figures import Panel
 from rl2grid.arrays import F64
@@ -34,6 +35,8 @@ MOST_POINTS = 400
 """Of a curve: a screen shows no more, and neither tells more."""
 DIGITS = 4
 """Significant digits of the numbers under the pointer."""
+LOOKS = len(LIGHT.series) * len(DASHES)
+"""Curves that look different."""
 FIRST_SHOWN = 8
 """Curves switched on when the page is opened: the best ones."""
 
@@ -116,6 +119,8 @@ def chart_data(chart: Chart) -> dict[str, Any]:
     """What the page embeds, ready for JSON."""
     scores = {line.label: [line.score] for panel in chart.panels[:1] for line in panel.lines}
     first, _ = leading(scores, FIRST_SHOWN)
+    # Where looks repeat, at least the best ones differ.
+    looks = {label: place for place, label in enumerate(scores)} if len(scores) > LOOKS else {}
     return {
         "x": chart.x,
         "xShare": chart.x_share,
@@ -126,7 +131,10 @@ def chart_data(chart: Chart) -> dict[str, Any]:
                 "title": panel.title,
                 "share": panel.share,
                 "threshold": panel.threshold,
-                "lines": [_line_data(line, chart.steps) for line in panel.lines],
+                "lines": [
+                    _line_data(replace(line, look=looks.get(line.label, line.look)), chart.steps)
+                    for line in panel.lines
+                ],
             }
             for panel in chart.panels
         ],
