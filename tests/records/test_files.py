@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from rl2grid.errors import UsageError
-from rl2grid.records.files import check_folder, make_folder, write_json, write_text
+from rl2grid.records.files import check_folder, make_folder, read_json, write_json, write_record, write_text
 
 
 def test_a_file_that_cannot_be_written_whole_stays_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -53,3 +53,30 @@ def test_a_folder_below_one_that_may_not_be_written_is_refused(tmp_path: Path, m
     monkeypatch.setattr("os.access", lambda path, mode: False)
     with pytest.raises(UsageError, match=r"may not be written\.$"):
         check_folder(tmp_path / "a")
+
+
+@pytest.mark.parametrize(
+    ("find", "replace", "refused"),
+    [
+        ("41", "42", True),
+        ('"checksum"', '"checksul"', True),
+        ('41,\n  "checksum"', '42,\n  "chmcksum"', True),
+        ("", "", False),
+    ],
+)
+def test_a_record_is_read_as_it_was_written_or_not_at_all(tmp_path: Path, find: str, replace: str, refused: bool):
+    path = tmp_path / "record.json"
+    write_record(path, {"name": "one", "number": 41})
+    assert path.read_text().count(find) >= 1
+    path.write_text(path.read_text().replace(find, replace))
+    if refused:
+        with pytest.raises(UsageError, match="it was changed since it was written"):
+            read_json(path, "a record", "write it again")
+    else:
+        assert read_json(path, "a record", "write it again") == {"name": "one", "number": 41}
+
+
+def test_a_record_whose_checksum_was_removed_is_meant(tmp_path: Path):
+    path = tmp_path / "record.json"
+    path.write_text('{"number": 42}')
+    assert read_json(path, "a record", "write it again") == {"number": 42}
