@@ -127,8 +127,59 @@ def test_curves_are_read_zoomed_and_switched(report):
         assert visit.errors == []
 
 
-def test_the_slider_of_an_episode_moves_the_clock(watch):
+def ready(page):
+    """What is compressed in the page has been unpacked."""
+    page.wait_for_function("window.page !== undefined")
+
+
+def test_keys_move_the_clock_of_an_episode(watch):
     with visiting(watch, PHONE) as visit:
+        ready(visit.page)
         before = visit.page.locator("#clock").inner_text()
         visit.page.keyboard.press("Shift+ArrowRight")
         assert visit.page.locator("#clock").inner_text() != before
+
+
+def test_the_timeline_is_in_view_and_nothing_jumps(watch):
+    with visiting(watch, (1400, 900)) as visit:
+        page = visit.page
+        ready(page)
+        places = set()
+        for key in ("Home", *["ArrowRight"] * 9, "End"):
+            page.keyboard.press(key)
+            boxes = [page.locator(name).bounding_box() for name in (".map svg", "#timeline", "#slider")]
+            places.add(tuple(tuple(box.values()) for box in boxes))
+        assert len(places) == 1
+        assert boxes[-1]["y"] + boxes[-1]["height"] <= 900
+        assert page.evaluate("document.documentElement.scrollHeight") <= 900
+        assert visit.errors == []
+
+
+def test_maps_zoom_pan_and_find(watch):
+    with visiting(watch, DESK) as visit:
+        page = visit.page
+        ready(page)
+        view = page.locator(".map svg")
+        whole = view.get_attribute("viewBox")
+        page.locator("#search").fill("load_4_3")
+        assert view.get_attribute("viewBox") != whole
+        assert page.locator("#found h2").inner_text() == "load 3 (load_4_3)"
+        page.locator("#fit").click()
+        assert view.get_attribute("viewBox") == whole
+        page.locator("#in").click()
+        near = view.get_attribute("viewBox")
+        box = view.bounding_box()
+        page.mouse.move(box["x"] + 200, box["y"] + 200)
+        page.mouse.down()
+        page.mouse.move(box["x"] + 260, box["y"] + 230, steps=4)
+        page.mouse.up()
+        assert view.get_attribute("viewBox") not in (near, whole)
+
+
+def test_names_are_written_on_demand(watch):
+    with visiting(watch, DESK) as visit:
+        page = visit.page
+        ready(page)
+        assert page.locator(".names text").count() == 0
+        page.locator("#names").select_option("names")
+        assert "load_4_3" in page.locator(".names text").all_text_contents()

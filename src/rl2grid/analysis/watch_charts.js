@@ -13,15 +13,19 @@ function columnsOf(width, steps) {
 }
 
 class Chart {
-  // `paint(pen, width, height)` draws what never changes; `steps` is the length of the axis of time.
-  constructor(canvas, steps, seek, paint) {
+  // `steps` is the length of the axis of time, `seek(step)` goes there, `tell(step)` says what is there, and
+  // `paint(pen, width, height)` draws what never changes.
+  constructor(canvas, steps, seek, tell, paint) {
     Object.assign(this, { canvas, steps, paint });
-    const go = event => {
+    const stepAt = event => {
       const box = canvas.getBoundingClientRect();
-      seek(Math.round(Math.max(0, Math.min(1, (event.clientX - box.left) / box.width)) * (steps - 1)));
+      return Math.round(Math.max(0, Math.min(1, (event.clientX - box.left) / box.width)) * (steps - 1));
     };
-    canvas.addEventListener("pointerdown", event => { canvas.setPointerCapture(event.pointerId); go(event); });
-    canvas.addEventListener("pointermove", event => { if (event.buttons) go(event); });
+    canvas.addEventListener("pointerdown", event => { canvas.setPointerCapture(event.pointerId); seek(stepAt(event)); });
+    canvas.addEventListener("pointermove", event => {
+      canvas.title = tell(stepAt(event));
+      if (event.buttons) seek(stepAt(event));
+    });
   }
 
   // Draws everything again: sizes, colours or what is shown have changed.

@@ -59,12 +59,13 @@ class Page {
 
   makeCharts() {
     const place = at("timeline"), seek = step => { this.pause(); this.show(step); };
+    const tell = step => this.tooltip(step);
     const add = (name, words, paint) => {
-      const label = made("div", place, { className: "words" });
+      const label = made("div", place, { className: `words ${name}` });
       label.innerHTML = words;
       const canvas = made("canvas", place, { className: name });
       canvas.setAttribute("aria-label", name);
-      return Object.assign(new Chart(canvas, this.axis, seek, paint), { label });
+      return Object.assign(new Chart(canvas, this.axis, seek, tell, paint), { label });
     };
     this.loadings = this.episodes.map(episode => {
       const paint = (...to) => paintLoading(episode, this.shades, this.thing, this.axis)(...to);
@@ -82,6 +83,12 @@ class Page {
   }
 
   repaint() { for (const chart of this.charts) chart.repaint(); }
+
+  // What is said of a step that the mouse points at.
+  tooltip(step) {
+    const worst = this.episodes.filter(each => step < each.steps).map(each => `${each.label}: ${percentOf(each.loadingAt(each.worstAt(step), step))}`);
+    return [`${this.episode.time(step)}, step ${step}`, ...worst].join("\n");
+  }
 
   get shades() { return this.colours[this.dark.matches ? "dark" : "light"]; }
 
@@ -103,6 +110,8 @@ class Page {
   makeControls() {
     this.slider = at("slider");
     this.slider.max = this.last;
+    at("previous").addEventListener("click", () => this.toEvent(-1));
+    at("next").addEventListener("click", () => this.toEvent(1));
     this.slider.addEventListener("input", () => { this.pause(); this.show(+this.slider.value); });
     at("play").addEventListener("click", () => this.timer ? this.pause() : this.play());
     at("earlier").addEventListener("click", () => { this.pause(); this.show(this.step, Math.max(0, this.episode.round - 1)); });
@@ -178,7 +187,7 @@ class Page {
     const { episode } = this, rounds = episode.step === this.step ? episode.rounds(episode.step) : 1;
     at("clock").textContent = `${episode.time(this.step)} · step ${this.step} of ${episode.length}`;
     at("rounds").className = rounds > 1 ? "shown" : "";
-    at("round").textContent = `cascade ${episode.round + 1} of ${rounds}`;
+    at("round").textContent = `${Math.min(episode.round + 1, rounds)} of ${rounds}`;
     at("earlier").disabled = episode.round === 0;
     at("later").disabled = episode.round === rounds - 1;
   }
@@ -369,6 +378,14 @@ class Page {
     this.show(Math.max(0, this.step - by));
   }
 
+  // The next thing that happened, or the one before.
+  toEvent(direction) {
+    this.pause();
+    const steps = this.episode.log().map(([step]) => step);
+    const step = direction > 0 ? steps.find(each => each > this.step) : steps.findLast(each => each < this.step);
+    if (step !== undefined) this.show(step, direction > 0 && this.cascadeBetween(step) ? 0 : Infinity);
+  }
+
   cascadeBetween(step) { return this.episodes.some(episode => episode.rounds(step) > 1 && step <= episode.last); }
 
   key(event) {
@@ -386,6 +403,8 @@ class Page {
       "-": () => this.view.zoom(1 / 1.5),
       0: () => this.view.fit(),
       f: () => this.toggleFlows(),
+      n: () => this.toEvent(1),
+      p: () => this.toEvent(-1),
       "/": () => at("search").focus(),
     }[event.key];
     if (!does) return;
@@ -410,4 +429,5 @@ class Page {
 }
 
 const data = JSON.parse(at("episode").textContent);
-loadEpisodes(data).then(episodes => { window.page = new Page(episodes, data); });
+if (typeof DecompressionStream === "undefined") at("now").textContent = "This page needs a browser of 2023 or later.";
+else loadEpisodes(data).then(episodes => { window.page = new Page(episodes, data); });
