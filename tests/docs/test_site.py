@@ -35,7 +35,24 @@ def test_no_page_fetches_anything(site):
 
 def test_the_page_of_the_tasks_describes_every_keyword(site):
     page = (site / "tasks.html").read_text(encoding="utf-8")
-    assert all(f"<td><code>{name}</code></td>" in page for name in OPTION_NAMES)
+    assert all(f'<td data-heading="keyword"><code>{name}</code></td>' in page for name in OPTION_NAMES)
+
+
+def test_the_first_page_has_a_picture_the_result_and_the_line_that_installs(site):
+    page = (site / "index.html").read_text(encoding="utf-8")
+    pictures = set(re.findall(r'src="(assets/[^"#]+[.]png)', page))
+    assert {"assets/grids/bus36-MO-v0-light.png", "assets/results/bus14-T0-dark.png"} <= pictures
+    assert all((site / picture).read_bytes().startswith(b"\x89PNG") for picture in pictures)
+    assert "% of a month survived" in re.sub("<[^>]+>", "", page)
+    assert "pip" in page
+    assert "<!--" not in page.split('<article class="md-content__inner')[1].split("</article>")[0]
+
+
+def test_code_is_wrapped_and_printed_columns_scroll(site):
+    page = (site / "notebooks" / "student.html").read_text(encoding="utf-8")
+    assert "aligned" in page
+    rules = (site / "assets" / "site.css").read_text(encoding="utf-8")
+    assert "pre > code { white-space: pre-wrap" in rules
 
 
 def test_formulas_are_mathml(site):
