@@ -115,7 +115,7 @@ def read_json(path: Path, what: str, remedy: str, shape: Shape = object) -> Any:
 
 
 def _name_of_checksum(value: Any) -> str | None:
-    """The last entry of an object, if it is its checksum, whose name may be damaged too; who means a change removes it."""
+    """The entry of an object that is its checksum; the last, if its name was damaged: a change removes it whole."""
     if not isinstance(value, dict) or not value:
         return None
     last = str(next(reversed(value)))
