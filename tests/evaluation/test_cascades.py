@@ -14,6 +14,7 @@ from rl2grid.agents.do_nothing import DoNothing
 from rl2grid.agents.greedy import Greedy
 from rl2grid.agents.random_agent import RandomAgent
 from rl2grid.envs.registration import register_all
+from rl2grid.errors import UsageError
 from rl2grid.evaluation.recording import record_episode
 from rl2grid.grids import load_grid
 from rl2grid.mdp.heuristics import SAFE_RHO
@@ -132,6 +133,16 @@ def test_an_agent_of_ones_own_may_say_what_it_considered():
     told = {each.action: each.preference for each in reason.alternatives}
     assert told == {"": 0.25, "action 2": 0.75}
     assert all(np.isnan(each.promised) for each in reason.alternatives)
+
+
+@pytest.mark.parametrize("said", ["because", Considered("liking", [1, 2], [0.5])])
+def test_an_explanation_of_another_kind_is_refused(said):
+    env = FakeGrid()
+    agent = Opinionated()
+    agent.explain = lambda: said
+    agent.bind(env)
+    with pytest.raises(UsageError, match=r"explain\(\) of agent 'do-nothing' returned"):
+        record_episode(agent, env, scenario="april", seed=2)
 
 
 def test_redispatch_promises_are_those_of_simulate():

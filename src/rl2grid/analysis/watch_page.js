@@ -278,7 +278,8 @@ class Page {
     made("p", place, {}, this.outcome(reason));
     this.tellChanges(place, reason.step);
     const preference = reason.preference && !this.saysLoading(reason) ? ` ${reason.preference}: what the agent says.` : "";
-    made("p", place, { className: "note" }, `Forecast: worst loading of the next step before protections act, of the best of ${reason.tried} actions, of doing nothing and of what was played.${preference}`);
+    const unknown = reason.alternatives.some(([, promised]) => promised === null) ? " –: not legal, or not known." : "";
+    made("p", place, { className: "note" }, `Forecast: worst loading of the next step before protections act, of the best of ${reason.tried} actions, of doing nothing and of what was played.${unknown}${preference}`);
   }
 
   tellChanges(place, step) {

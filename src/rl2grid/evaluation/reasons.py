@@ -37,11 +37,15 @@ class Reasons:
         self._space = env.action_space
 
     def of(self, action: Action, step: int) -> Reason | None:
-        """The reason of an action that is about to be played; None where the grid is safe and nothing is done."""
+        """The reason of an action that is about to be played; None where the grid is safe and nothing is done.
+
+        Raises:
+            UsageError: the agent explains itself with something else than a ``Considered``.
+        """
         base: Any = self._env
         if not np.any(action) and base.state.rho[0].max() < SAFE_RHO:
             return None
-        considered = self._agent.explain() if isinstance(self._agent, ExplainingAgent) else None
+        considered = _checked(self._agent)
         reason_of = self._among_ids if self._discrete else self._among_plans
         return reason_of(action, step, considered)
 
@@ -52,7 +56,7 @@ class Reasons:
         n = int(self._space.n)  # type: ignore[attr-defined]
         promised = self._promises(list(range(n)) if n <= MOST_TRIED else list(named))
         best = sorted((loading, k) for k, loading in promised.items() if np.isfinite(loading))[:SHOWN]
-        ids = sorted(dict.fromkeys((*named, *(k for _, k in best))), key=lambda k: (promised.get(k, np.nan), k))
+        ids = sorted(dict.fromkeys((*named, *(k for _, k in best))), key=lambda k: (promised.get(k, np.inf), k))
         alternatives = tuple(
             Alternative(
                 base.describe_action(k) if k != _NOTHING else "",
@@ -95,7 +99,7 @@ class Reasons:
             for plan, value in plans.values()
         ]
         tried = len(considered.actions) if considered else len(alternatives)
-        ranked = tuple(sorted(alternatives, key=lambda each: each.promised))
+        ranked = tuple(sorted(alternatives, key=lambda each: np.nan_to_num(each.promised, nan=np.inf)))
         return Reason(step, *_said(considered), tried, ranked)
 
     def _simulated(self, plan: Action) -> float:
@@ -106,6 +110,21 @@ class Reasons:
             return worst_loading(base, plan)
         except UsageError:  # a scenario without forecasts
             return float("nan")
+
+
+def _checked(agent: Agent) -> Considered | None:
+    """What an agent says, if it says anything."""
+    if not isinstance(agent, ExplainingAgent):
+        return None
+    considered = agent.explain()
+    if considered is None:
+        return None
+    if not isinstance(considered, Considered) or len(considered.actions) != len(considered.values):
+        raise UsageError(
+            f"explain() of agent {agent.name!r} returned {considered!r:.80}: return None, or a "
+            "rl2grid.agents.agent.Considered with as many values as actions."
+        )
+    return considered
 
 
 def _said(considered: Considered | None) -> tuple[str, str]:
