@@ -382,7 +382,9 @@ class Page {
   // The next thing that happened, or the one before.
   toEvent(direction) {
     this.pause();
-    const steps = this.episode.log().map(([step]) => step);
+    const { episode } = this;
+    if (direction > 0 && episode.step === this.step && episode.round < episode.rounds(this.step) - 1) return this.show(this.step, episode.round + 1);
+    const steps = episode.log().map(([step]) => step);
     const step = direction > 0 ? steps.find(each => each > this.step) : steps.findLast(each => each < this.step);
     if (step !== undefined) this.show(step, direction > 0 && this.cascadeBetween(step) ? 0 : Infinity);
   }
