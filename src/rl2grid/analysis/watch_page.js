@@ -74,7 +74,7 @@ class Page {
       return chart;
     });
     // Demand and weather are the same for all: those of whoever lives longest are known longest.
-    const longest = this.episodes.reduce((best, each) => each.steps > best.steps ? each : best);
+    const longest = this.longest = this.episodes.reduce((best, each) => each.steps > best.steps ? each : best);
     this.mix = add("mix", "", (...to) => paintMix(this.episode, longest, this.axis)(...to));
     this.weather = add("weather", "", (...to) => paintWeather(this.episode, longest, this.axis)(...to));
     this.charts = [...this.loadings, this.mix, this.weather];
@@ -203,11 +203,12 @@ class Page {
   }
 
   tellTotals() {
-    const { episode } = this, { totals } = episode, mega = name => `${episode.total(name).toFixed(0)} MW`;
-    this.fillLabel(this.mix.label, `demand ${mega("demand")}`, " (line)", totals.kinds.map(kind => [kind, episode.total(kind).toFixed(0)]));
+    const { episode, longest } = this, { totals } = episode, isOver = this.step > episode.last;
+    const produced = totals.kinds.map(kind => [kind, isOver ? "–" : episode.total(kind).toFixed(0)]);
+    this.fillLabel(this.mix.label, `demand ${longest.total("demand").toFixed(0)} MW`, " (line)", produced);
     const weather = totals.weather.map((kind, k) => {
-      const share = Math.round(100 * episode.total(`${kind} available`) / totals.capacity[k]);
-      const cut = episode.total(`${kind} available`) - episode.total(kind);
+      const share = Math.round(100 * longest.total(`${kind} available`) / totals.capacity[k]);
+      const cut = isOver ? 0 : episode.total(`${kind} available`) - episode.total(kind);
       return [kind, `${share}%${cut > 1 ? `, curtailed ${cut.toFixed(0)} MW` : ""}`];
     });
     this.fillLabel(this.weather.label, "weather", ", share of capacity", weather);
