@@ -10,7 +10,7 @@ COPY pyproject.toml README.md LICENSE NOTICE ./
 COPY src src
 RUN pip install --no-cache-dir -c constraints.txt ".[train,analysis]"
 # Months and compiled code are kept here: mount it to keep them from one container to the next.
-ENV RL2GRID_DATA=/data OPENBLAS_NUM_THREADS=1
+ENV RL2GRID_DATA=/data XDG_CACHE_HOME=/data/cache OPENBLAS_NUM_THREADS=1
 VOLUME /data
 WORKDIR /out
 ENTRYPOINT ["rl2grid"]

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from rl2grid.records.evaluations import Evaluation
 
 __all__ = ["evaluate", "load", "register_system", "tasks", "train"]
-__version__ = "0.1.0"
+__version__ = "1.0.0rc1"
 
 register_all()
 
