@@ -58,6 +58,13 @@ def test_training_has_its_panels_its_dots_its_validation_and_its_threshold():
     assert "marks" not in tlo["lines"][0]
 
 
+def test_what_is_not_drawn_is_not_named():
+    one = training_chart({"ppo": [curve()]}, SURVIVAL_PANELS, title="Training").sentence
+    several = training_chart({"ppo": [curve(seed=k) for k in range(2)]}, SURVIVAL_PANELS, title="Training").sentence
+    assert one.endswith("Dots: iterations of one run. Diamonds: validation.")
+    assert several.endswith("Bands: 95% intervals over runs. Diamonds: validation.")
+
+
 def test_a_long_staircase_is_thinned_and_stays_exact_where_it_is_read():
     survivals = np.random.default_rng(0).uniform(0, 0.999, (600, 1)).tolist()
     (method,) = group_methods([result("a", survivals, episode_length=8064)])[TASK]

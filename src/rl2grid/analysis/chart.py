@@ -81,7 +81,11 @@ def training_chart(
         )
         for panel in panels
     )
-    sentence = f"Means over {SMOOTHED_EPISODES} episodes; bands: 95% intervals over runs."
+    sentence = f"Means over {SMOOTHED_EPISODES} episodes."
+    if any(line.low is not None for panel in drawn for line in panel.lines):
+        sentence += " Bands: 95% intervals over runs."
+    if any(line.dots for panel in drawn for line in panel.lines):
+        sentence += " Dots: iterations of one run."
     if any(line.marks for panel in drawn for line in panel.lines):
         sentence += " Diamonds: validation."
     return Chart(title, sentence, "Decisions" if x == "decisions" else "Grid steps", drawn)

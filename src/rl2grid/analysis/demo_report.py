@@ -74,7 +74,8 @@ def write_demo_report(
     summaries = [result.summary for result in results]
     ranked = sorted(summaries, key=lambda summary: -summary.survival.value)
     page = PageBuilder(title)
-    page.add_header(_facts(summaries), introduction=introduction)
+    # Wide enough for all columns of the table on a desk.
+    page.add_header(_facts(summaries), introduction=introduction, style="body { max-width: 72rem; }")
     legend = f"<p class=note>{html.escape(summary_table.LEGEND)}</p>"
     by_task = group_methods(results)
     (methods,) = by_task.values()
