@@ -123,7 +123,7 @@ class Page {
   // Shows all maps, or that of one agent.
   layOut(which) {
     at("layout").value = which;
-    this.maps.forEach((map, k) => { map.figure.hidden = which !== "all" && +which !== k; map.figure.style.display = map.figure.hidden ? "none" : ""; });
+    this.maps.forEach((map, k) => { map.figure.hidden = which !== "all" && +which !== k; });
     if (which !== "all") this.choose(+which);
     this.arrange();
   }
@@ -142,7 +142,7 @@ class Page {
   choose(k) {
     const changed = this.told !== k;
     this.chosen = this.told = k;
-    this.maps.forEach((map, j) => map.figure.classList.toggle("chosen", j === k && this.maps.length > 1 || this.maps.length === 1));
+    this.maps.forEach((map, j) => map.figure.classList.toggle("chosen", j === k));
     this.tabs.forEach((tab, j) => tab.setAttribute("aria-pressed", j === k));
     if (!changed) return;
     this.makeLog();
