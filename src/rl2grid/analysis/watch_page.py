@@ -222,7 +222,7 @@ def _cascade_data(recording: Recording, cascade: Cascade) -> dict[str, Any]:
                 "moved": _moved(before, each.topo_vect),
                 "rho": None if np.isnan(each.rho).all() else np.rint(100 * each.rho).astype(int).tolist(),
                 "forward": (each.p_or >= 0).astype(int).tolist(),
-                "trips": [[line, round(100 * loading), overloaded] for line, loading, overloaded in each.trips],
+                "trips": [[line, round(100 * loading, 1), overloaded] for line, loading, overloaded in each.trips],
             }
             for each in cascade.rounds
         ],
