@@ -3,6 +3,8 @@
 import json
 import multiprocessing
 import os
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from datetime import datetime
@@ -235,3 +237,28 @@ def test_a_folder_that_is_only_read_is_hashed_every_time(
     for expected in (1, 2):
         load(tmp_path / "log")
         assert len(hashed) == expected
+
+
+MANY = """
+import resource, sys
+from datetime import datetime
+import numpy as np
+from rl2grid.errors import UsageError
+from rl2grid.scenarios.cache import cached_series
+from rl2grid.scenarios.folder import FolderContent
+resource.setrlimit(resource.RLIMIT_NOFILE, (40, int(sys.argv[1])))
+content = FolderContent(datetime(2019, 1, 6), {"load_p": np.zeros((10, 3), np.float32)})
+try:
+    series = [cached_series("bus14", f"generated.{number}", "0" * 20, lambda: content) for number in range(80)]
+    print(len(series))
+except UsageError as error:
+    print(error)
+"""
+
+
+@pytest.mark.parametrize(("most", "said"), [(200, "80"), (40, "This process has as many open files as it may")])
+def test_more_months_are_mapped_than_a_process_may_have_files_at_first(folder: Path, most: int, said: str) -> None:
+    command = [sys.executable, "-c", MANY, str(most)]
+    environment = os.environ | {"PYTHONPATH": str(Path(cache.__file__).parents[2])}
+    ended = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert ended.stdout.startswith(said)

@@ -15,6 +15,8 @@ disk, is found by the latter alone.
 from __future__ import annotations
 
 import contextlib
+import errno
+import functools
 import glob
 import hashlib
 import json
@@ -64,6 +66,7 @@ def cached_series(grid_id: str, name: str, key: str, build: Callable[[], FolderC
     Raises:
         UsageError: The data folder cannot be written; or what ``build`` raises.
     """
+    _allow_many_files()
     folder = data_folder() / "series" / f"v{FORMAT_VERSION}" / grid_id
     stem = folder / f"{name.replace('/', '.')}-{key[:16]}"
     data, manifest = stem.with_name(stem.name + ".npy"), stem.with_name(stem.name + ".json")
@@ -77,10 +80,31 @@ def cached_series(grid_id: str, name: str, key: str, build: Callable[[], FolderC
         with filelock.FileLock(stem.with_name(stem.name + ".lock")):
             series = _read(data, manifest) or _make(data, manifest, build())
     except OSError as error:
+        if error.errno == errno.EMFILE:
+            raise UsageError(
+                "This process has as many open files as it may, and every month that is played is one: allow more "
+                "(ulimit -n), or make fewer environments."
+            ) from error
         raise UsageError(
             f"The data folder {data_folder()} cannot be written ({error}): set RL2GRID_DATA to one that can."
         ) from error
     return series
+
+
+@functools.cache
+def _allow_many_files() -> None:
+    """Let this process have as many open files as the system allows it, not the few that it begins with.
+
+    Every mapped month counts as one for as long as an environment plays it: the usual 1,024 end a vector of as many.
+    """
+    try:
+        import resource
+    except ImportError:  # not a system with such limits
+        return
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft != hard:
+        with contextlib.suppress(OSError, ValueError):
+            resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
 
 
 def remove_damaged(grid_id: str) -> list[Path]:
