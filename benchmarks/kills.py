@@ -46,12 +46,18 @@ OFTEN = ("--checkpoint-seconds", "0.5", "--evaluate-every", "512", "--validation
 STUDY = """name = "kills"
 split = "validation"
 seeds = [1, 2]
+months = 2
+budget = 512
+validations = 1
 
 [[group]]
 tasks = ["bus14-T0"]
-agents = ["do-nothing", "random", "ppo"]
-months = 2
-hyperparameters.ppo = {num_envs = 4, num_steps = 32, total_timesteps = 512}
+agents = ["do-nothing", "random"]
+
+[[group]]
+tasks = ["bus14-T0"]
+algorithms = ["ppo"]
+heuristics = ["idle"]
 """
 AT_MOST = 1800.0
 """Seconds after which a call is not waited for any longer."""
