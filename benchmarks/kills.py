@@ -132,7 +132,7 @@ def _without_times(value: Any) -> Any:
         return [_without_times(each) for each in value]
     if not isinstance(value, dict):
         return value
-    timed = ("time", "second", "energy", "checksum", "joule", "folder", "started", "ended", "date", "command")
+    timed = ("time", "minute", "second", "energy", "checksum", "joule", "folder", "started", "ended", "date", "command")
     return {key: _without_times(each) for key, each in value.items() if not any(word in key for word in timed)}
 
 
