@@ -74,7 +74,7 @@ WRITERS = (
     Subject("watch --output", _watched, _watched, _is_there("watch")),
     Subject("data export", _exported, _exported, _is_there("export")),
 )
-ALL = (*(one for one in SUBJECTS if not one.cold), *WRITERS)
+ALL = (*WRITERS, *reversed([one for one in SUBJECTS if not one.cold]))
 
 
 def mount(folder: Path, size: int) -> None:

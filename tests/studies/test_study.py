@@ -250,9 +250,11 @@ def test_a_cell_on_a_full_disk_fails_with_a_sentence_and_may_be_tried_again():
         "import errno, sys\nfrom rl2grid.studies.cell import serve\n"
         "def do():\n    raise OSError(errno.ENOSPC, 'No space left on device', 'run/metrics.csv')\nsys.exit(serve(do))"
     )
-    ended = subprocess.run([sys.executable, "-c", code], env=environment(), capture_output=True, text=True, check=False)
-    assert ended.returncode == FAILED
-    assert ended.stderr == "rl2grid: run/metrics.csv cannot be read or written: No space left on device.\n"
+    command, pipe = [sys.executable, "-c", code], subprocess.PIPE
+    with subprocess.Popen(command, env=environment(), stdin=pipe, stderr=pipe, text=True) as process:
+        said = process.stderr.read()  # before the standard input ends, which asks a cell to stop
+    assert process.returncode == FAILED
+    assert said == "rl2grid: run/metrics.csv cannot be read or written: No space left on device.\n"
 
 
 @pytest.mark.slow
