@@ -14,7 +14,6 @@ import hashlib
 import json
 import os
 import random
-import shlex
 import subprocess
 import sys
 import tempfile
@@ -23,9 +22,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from kills import AT_MOST, SUBJECTS, Subject, call, log_of
-
-from rl2grid.records.files import write_json
+from kills import AT_MOST, SUBJECTS, Subject, call, log_of, run_campaign
 
 RESULTS = Path(__file__).resolve().parent / "results" / "full_disk.json"
 INSIDE = "RL2GRID_OWN_MOUNTS"
@@ -144,22 +141,13 @@ def main() -> int:
         os.environ[INSIDE] = "1"
         os.execvp("unshare", ["unshare", "--map-root-user", "--mount", sys.executable, *sys.argv])
     subjects = [one for one in ALL if options.only is None or one.name in options.only]
-    command = shlex.join(["python", "benchmarks/full_disk.py", *sys.argv[1:]])
-    stored = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
-    cells: dict[str, Any] = stored["subjects"] if stored.get("command") == command else {}
     with tempfile.TemporaryDirectory() as scratch:
-        for subject in subjects:
-            if subject.name not in cells:
-                draws = random.Random(hashlib.sha256(f"{options.seed} {subject.name}".encode()).digest())
-                found = run_subject(subject, -(-options.number // len(subjects)), Path(scratch) / "disk", draws)
-                cells[subject.name] = vars(found)
-            print(f"{subject.name}: {cells[subject.name]}", flush=True)
-            if options.only is None:
-                disks = sum(cell["disks"] for cell in cells.values())
-                failures = sum(len(cell["failures"]) for cell in cells.values())
-                result = {"command": command, "disks": disks, "failures": failures, "subjects": cells}
-                write_json(RESULTS, result, indent=1)
-    return 1 if any(cell["failures"] for cell in cells.values()) else 0
+
+        def fill(subject: Subject) -> Found:
+            draws = random.Random(hashlib.sha256(f"{options.seed} {subject.name}".encode()).digest())
+            return run_subject(subject, -(-options.number // len(subjects)), Path(scratch) / "disk", draws)
+
+        return run_campaign(RESULTS if options.only is None else None, subjects, fill, ("disks",))
 
 
 if __name__ == "__main__":

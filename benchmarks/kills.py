@@ -24,7 +24,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -260,6 +260,31 @@ def run_subject(subject: Subject, kills: int, folder: Path, draws: random.Random
     return found
 
 
+def run_campaign(
+    results: Path | None, subjects: Sequence[Subject], break_it: Callable[[Subject], Any], counts: Sequence[str]
+) -> int:
+    """Break all subjects that the results of the same command do not have yet; returns the exit status.
+
+    Args:
+        results: written after every subject; None: nowhere.
+        subjects: what is broken.
+        break_it: does it; what it returns has ``failures`` and all of ``counts``.
+        counts: what is added up over the subjects.
+    """
+    command = shlex.join(["python", f"benchmarks/{Path(sys.argv[0]).name}", *sys.argv[1:]])
+    stored = json.loads(results.read_text()) if results is not None and results.exists() else {}
+    cells: dict[str, Any] = stored["subjects"] if stored.get("command") == command else {}
+    for subject in subjects:
+        if subject.name not in cells:
+            cells[subject.name] = vars(break_it(subject))
+        print(f"{subject.name}: {cells[subject.name]}", flush=True)
+        if results is not None:
+            total = {name: sum(cell[name] for cell in cells.values()) for name in counts}
+            failures = sum(len(cell["failures"]) for cell in cells.values())
+            write_json(results, {"command": command, **total, "failures": failures, "subjects": cells}, indent=1)
+    return 1 if any(cell["failures"] for cell in cells.values()) else 0
+
+
 def main() -> int:
     """Kill all subjects, write the result, and say whether anything failed."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
@@ -270,23 +295,14 @@ def main() -> int:
     options = parser.parse_args()
     subjects = [one for one in SUBJECTS if options.only is None or one.name in options.only]
     unit = options.kills / sum(one.share for one in subjects)
-    command = shlex.join(["python", "benchmarks/kills.py", *sys.argv[1:]])
-    stored = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
-    cells: dict[str, Any] = stored["subjects"] if stored.get("command") == command else {}
     with tempfile.TemporaryDirectory() as scratch:
         root = (options.folder or Path(scratch)).resolve()
-        for subject in subjects:
-            if subject.name not in cells:
-                draws = random.Random(f"{options.seed} {subject.name}")
-                cells[subject.name] = asdict(
-                    run_subject(subject, -int(-unit * subject.share // 1), root / subject.name.replace(" ", "-"), draws)
-                )
-            print(f"{subject.name}: {cells[subject.name]}", flush=True)
-            if options.only is None:
-                total = {name: sum(cell[name] for cell in cells.values()) for name in ("kills", "runs", "calls")}
-                failures = sum(len(cell["failures"]) for cell in cells.values())
-                write_json(RESULTS, {"command": command, **total, "failures": failures, "subjects": cells}, indent=1)
-    return 1 if any(cell["failures"] for cell in cells.values()) else 0
+
+        def kill(subject: Subject) -> Found:
+            kills, folder = -int(-unit * subject.share // 1), root / subject.name.replace(" ", "-")
+            return run_subject(subject, kills, folder, random.Random(f"{options.seed} {subject.name}"))
+
+        return run_campaign(RESULTS if options.only is None else None, subjects, kill, ("kills", "runs", "calls"))
 
 
 if __name__ == "__main__":
