@@ -9,7 +9,6 @@ from __future__ import annotations
 import html
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from importlib import resources
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,7 @@ from rl2grid.analysis.curves import (
     training_lines,
 )
 from rl2grid.analysis.figures import DASHES
-from rl2grid.analysis.page import embedded
+from rl2grid.analysis.page import embedded, resource_text
 from rl2grid.analysis.training_figures import Panel
 from rl2grid.arrays import F64
 from rl2grid.drawing.theme import DARK, LIGHT, Theme
@@ -147,7 +146,7 @@ def chart_data(chart: Chart) -> dict[str, Any]:
 
 def chart_assets() -> str:
     """Rules and the script that a page with charts embeds once, behind the last of them."""
-    return f"<style>{_resource('chart.css')}{_colours()}</style><script>{_resource('chart.js')}</script>"
+    return f"<style>{resource_text('chart.css')}{_colours()}</style><script>{resource_text('chart.js')}</script>"
 
 
 def _line_data(line: Line, steps: bool) -> dict[str, Any]:
@@ -194,7 +193,3 @@ def _colours() -> str:
         return ":root{" + "".join(f"--curve-{k}:{colour};" for k, colour in enumerate(theme.series)) + "}"
 
     return f"{rule(LIGHT)}@media (prefers-color-scheme: dark){{{rule(DARK)}}}"
-
-
-def _resource(name: str) -> str:
-    return (resources.files("rl2grid.analysis") / name).read_text(encoding="utf-8")

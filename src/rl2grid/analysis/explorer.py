@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from importlib import resources
 from typing import Any
 
-from rl2grid.analysis.page import embedded, filled
+from rl2grid.analysis.page import embedded, filled, resource_text
 from rl2grid.envs.tasks import short_id
 from rl2grid.mdp.termination import GAME_OVER_TEXT, GameOver
 from rl2grid.records.episodes import Episode
@@ -70,7 +69,7 @@ def explorer_html(results: Sequence[Evaluation], made_by: Sequence[str]) -> str:
         made_by: of each of them, the id of the element of the page that has its command.
     """
     data = embedded(explorer_data(results, made_by))
-    return filled(_resource("explorer.html"), script=_resource("explorer.js"), data=data)
+    return filled(resource_text("explorer.html"), script=resource_text("explorer.js"), data=data)
 
 
 def explorer_data(results: Sequence[Evaluation], made_by: Sequence[str]) -> dict[str, Any]:
@@ -107,7 +106,3 @@ def _words(values: Sequence[str]) -> dict[str, Any]:
 def _short(value: float) -> float | int:
     rounded = float(f"{value:.{DIGITS}g}")
     return int(rounded) if rounded.is_integer() else rounded
-
-
-def _resource(name: str) -> str:
-    return (resources.files("rl2grid.analysis") / name).read_text(encoding="utf-8")

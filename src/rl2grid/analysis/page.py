@@ -8,6 +8,7 @@ import itertools
 import json
 import re
 from collections.abc import Mapping, Sequence
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,11 @@ def write_page(path: Path, title: str, parts: Sequence[str]) -> None:
     """Write one HTML page that needs no other file, in the place of an earlier one; ``parts`` are HTML."""
     page = filled(_PAGE, title=html.escape(printable(title)), body="\n".join(parts), first_folded=str(FOLDED_FROM + 1))
     write_text(path, page)
+
+
+def resource_text(name: str) -> str:
+    """A template, script or style sheet of this package."""
+    return (resources.files("rl2grid.analysis") / name).read_text(encoding="utf-8")
 
 
 def filled(template: str, **parts: str) -> str:

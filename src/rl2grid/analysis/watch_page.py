@@ -13,7 +13,6 @@ import html
 import zlib
 from collections import Counter
 from collections.abc import Sequence
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ import numpy as np
 from matplotlib.colors import to_hex
 from numpy.typing import NDArray
 
-from rl2grid.analysis.page import embedded, filled, write_page
+from rl2grid.analysis.page import embedded, filled, resource_text, write_page
 from rl2grid.drawing.grid_drawing import geometry_of, largest_power, loading_colours
 from rl2grid.drawing.theme import DARK, FULL_SCALE, LIGHT, Theme
 from rl2grid.grids import Grid
@@ -47,9 +46,9 @@ def write_watch_page(path: Path, grid: Grid, recordings: Sequence[Recording]) ->
     task = first.task.removeprefix("rl2grid/")
     heading = f"{task}, {first.scenario}, seed {first.seed}"
     title = f"{heading}: {' against '.join(labels)}"
-    script = "\n".join(_resource(name) for name in _SCRIPTS)
+    script = "\n".join(resource_text(name) for name in _SCRIPTS)
     body = filled(
-        _resource("watch_page.html"),
+        resource_text("watch_page.html"),
         title=html.escape(printable(title)),
         heading=html.escape(printable(heading)),
         legend=_legend(grid),
@@ -308,7 +307,3 @@ def _legend(grid: Grid) -> str:
         shapes[name] = f"<path class='line off {name}' d='M0 6h28' />"
     entries = [f"<span><svg viewBox='0 0 28 12'>{shape}</svg> {name}</span>" for name, shape in shapes.items()]
     return "".join((*entries, "<span>symbol size: MW</span>"))
-
-
-def _resource(name: str) -> str:
-    return (resources.files("rl2grid.analysis") / name).read_text(encoding="utf-8")
