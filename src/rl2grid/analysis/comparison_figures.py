@@ -212,7 +212,7 @@ def varied(methods: Sequence[Method]) -> tuple[Method, ...]:
 
 def best_pair(methods: Sequence[Method]) -> tuple[Method, Method]:
     """The two methods that survive longest on average, the better one last."""
-    first, second = sorted(methods, key=lambda method: -method.scores("survival").values.mean())[:2]
+    first, second = sorted(methods, key=lambda method: -method.survival)[:2]
     return second, first
 
 

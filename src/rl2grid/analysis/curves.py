@@ -80,11 +80,9 @@ def profile_lines(methods: Sequence[Method]) -> list[Line]:
     levels = np.linspace(0, 1, THRESHOLDS_DRAWN)
     lines = []
     for look, method in enumerate(methods):
-        scores = method.scores("survival")
         # Nothing is longer than a completed episode: the last point would always be 0.
-        share, low, high = (values[:-1] for values in profile_band(scores, levels))
-        score = float(scores.values.mean())
-        lines.append(Line(method.label, levels[:-1], share, low, high, score=score, look=look))
+        share, low, high = (values[:-1] for values in profile_band(method.scores("survival"), levels))
+        lines.append(Line(method.label, levels[:-1], share, low, high, score=method.survival, look=look))
     return _best_first(lines)
 
 
@@ -97,8 +95,7 @@ def lifetime_lines(methods: Sequence[Method]) -> list[Line]:
         alive, low, high = (np.append(values, values[-1]) for values in (curve.alive, curve.low, curve.high))
         marks = Points(np.array([end]), alive[-1:]) if curve.censored.size else None
         days = np.append(curve.steps / STEPS_PER_DAY, end)
-        score = float(method.scores("survival").values.mean())
-        lines.append(Line(method.label, days, alive, low, high, marks=marks, score=score, look=look))
+        lines.append(Line(method.label, days, alive, low, high, marks=marks, score=method.survival, look=look))
     return _best_first(lines)
 
 
@@ -114,7 +111,7 @@ def leading(scores: Mapping[str, Sequence[float]], most: int = MOST_LINES) -> tu
 
 def leading_methods(methods: Sequence[Method]) -> tuple[tuple[Method, ...], str]:
     """:func:`leading` of methods of one task, by survival."""
-    labels, words = leading({method.label: [float(method.scores("survival").values.mean())] for method in methods})
+    labels, words = leading({method.label: [method.survival] for method in methods})
     return tuple(method for method in methods if method.label in labels), words
 
 

@@ -104,7 +104,7 @@ def _rankings(methods: Methods, results: Sequence[Evaluation]) -> str:
         if len(methods) <= UNFOLDED_TASKS:
             parts.append(f"<h3>{short}</h3>{table}")
             continue
-        best = f"{html.escape(ranked[0].label)}, survival {ranked[0].scores('survival').values.mean():.3f}"
+        best = f"{html.escape(ranked[0].label)}, survival {ranked[0].survival:.3f}"
         unfolded = " open" if number == 0 else ""
         parts.append(
             f"<details{unfolded}><summary><b>{short}</b> best of {len(ranked)}: {best}</summary>{table}</details>"

@@ -75,6 +75,11 @@ class Method:
         """A column of :class:`~rl2grid.records.episodes.Episode`."""
         return column_scores([result.episodes for result in self.evaluations], column)
 
+    @property
+    def survival(self) -> float:
+        """Mean over runs and episodes."""
+        return float(self.scores("survival").values.mean())
+
     def within(self, constraint: str) -> Scores:
         """1 for episodes whose cost reached its threshold at most, else 0."""
         return Scores((self.scores(COSTS[constraint]).values <= THRESHOLDS[constraint]).astype(np.float64), UNIT)
