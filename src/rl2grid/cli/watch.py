@@ -108,17 +108,18 @@ def _files(task: Task, recordings: Sequence[Recording], options: argparse.Namesp
 
 def _tell(output: Output, recordings: Sequence[Recording], labels: Sequence[str]) -> None:
     for recording, label in zip(recordings, labels, strict=True):
-        acted = sum(bool(words) for words in recording.actions)
         ending = f"game over: {recording.game_over}" if recording.game_over else "alive at the end"
         who = f"{label}: " if len(recordings) > 1 else ""
-        output.text(f"{who}{recording.n_steps:,} of {recording.episode_length:,} steps, {acted:,} actions; {ending}.")
+        output.text(
+            f"{who}{recording.n_steps:,} of {recording.episode_length:,} steps, {recording.n_acts:,} actions; {ending}."
+        )
 
 
 def _result(recording: Recording) -> dict[str, Any]:
     return {
         "steps": recording.n_steps,
         "episode_length": recording.episode_length,
-        "actions": sum(bool(words) for words in recording.actions),
+        "actions": recording.n_acts,
         "game_over": recording.game_over or None,
     }
 

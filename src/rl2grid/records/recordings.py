@@ -138,3 +138,8 @@ class Recording:
     def n_steps(self) -> int:
         """Steps survived."""
         return len(self.rho) - 1
+
+    @property
+    def n_acts(self) -> int:
+        """Decisions that changed something."""
+        return sum(bool(words) for words in self.actions)
