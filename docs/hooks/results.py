@@ -6,6 +6,7 @@ Pages name the tasks, with ``<!-- results: bus14-T0 -->``, or with ``<!-- figure
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from pictures import add_picture, picture_markdown
 from rl2grid.analysis.ledger_figure import draw_ledger
 from rl2grid.analysis.ledger_table import short_ledger_table
 from rl2grid.envs.tasks import find_task
-from rl2grid.records.ledger import read_ledger
+from rl2grid.records.ledger import HashedTest, read_ledger
 
 LEDGER = Path(__file__).resolve().parents[2] / "benchmarks" / "results" / "baselines.json"
 PAGES = ("results.md", "index.md")
@@ -35,12 +36,14 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Put figures and tables where the page asks for them."""
-    return _MARK.sub(_shown, markdown) if page.file.src_uri in PAGES else markdown
+    if page.file.src_uri not in PAGES:
+        return markdown
+    return _MARK.sub(partial(_shown, read_ledger(LEDGER)), markdown)
 
 
-def _shown(mark: re.Match[str]) -> str:
+def _shown(results: Mapping[str, HashedTest], mark: re.Match[str]) -> str:
     kind, task = mark.groups()
     figure = picture_markdown(f"results/{task}", f"survival on the test months of {task}")
     if kind == "figure":
         return figure
-    return f"{figure}\n\n{short_ledger_table(read_ledger(LEDGER), find_task(task).id)}"
+    return f"{figure}\n\n{short_ledger_table(results, find_task(task).id)}"
