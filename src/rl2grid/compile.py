@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
-import numpy as np
 import platformdirs
+from numba.core.types.misc import unliteral
 
 from rl2grid import compile_notices
 from rl2grid.compiled_files import verify_files_of
@@ -61,6 +61,7 @@ def jit(function: Function) -> Function:
     finally:
         numba.config.CACHE_DIR = previous
     verify_files_of(compiled)
+    _take_literals_as_numbers(compiled)
     return compiled
 
 
@@ -82,11 +83,17 @@ def owning_jit(function: Function) -> Function:
     return cast(Function, compiled)
 
 
-def int64(value: int) -> int:
-    """A number for compiled code that is no literal: for each literal of a call, Numba compiles what is called anew."""
-    return cast(int, np.int64(value))
+def _take_literals_as_numbers(compiled: Any) -> None:
+    """Compile a function once for ``f(0)``, ``f(1)`` and ``f(i)``.
 
+    For Numba every literal that a compiled caller gives is a type of its own, for which the function and all that it
+    calls are compiled again: most of the engine, twice.
+    """
+    if not hasattr(compiled, "get_call_template"):  # Numba is told not to compile
+        return
+    typed = compiled.get_call_template
 
-def boolean(value: int) -> bool:
-    """:func:`int64` for True and False."""
-    return cast(bool, np.bool_(value))
+    def get_call_template(args: tuple[Any, ...], kws: dict[str, Any]) -> Any:
+        return typed(tuple(map(unliteral, args)), {name: unliteral(kind) for name, kind in kws.items()})
+
+    compiled.get_call_template = get_call_template

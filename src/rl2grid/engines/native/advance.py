@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rl2grid.arrays import F32
-from rl2grid.compile import int64, jit
+from rl2grid.compile import jit
 from rl2grid.engines.native.action_notes import note_action
 from rl2grid.engines.native.environments import Environments, open_environments
 from rl2grid.engines.native.orders import Orders, order_one_change
-from rl2grid.engines.native.simulation import TRIAL, begin_simulation, copy_environment, finish_simulation
-from rl2grid.engines.native.step import EXACT, begin_step, dispatch_or_lose, finish_step, reset_row
+from rl2grid.engines.native.simulation import begin_simulation, copy_environment, finish_simulation
+from rl2grid.engines.native.step import begin_step, dispatch_or_lose, finish_step, reset_row
 from rl2grid.mdp.accumulate import accrue, begin_episode, begin_transition, end_reset
 from rl2grid.mdp.actions import ActionKind
 from rl2grid.mdp.heuristics import (
@@ -39,7 +39,6 @@ DEFAULT, PAPER, RELEASED = range(3)
 """Rewards that are compiled in."""
 
 _NOTHING, _MOVE = int(ActionKind.NOTHING), int(ActionKind.MOVE)
-_FIRST, _NEXT = int64(0), int64(1)
 
 Components = tuple[float, float, float]
 
@@ -155,7 +154,7 @@ def _heuristic_action(environments: Environments, simulated: int, i: int, heuris
 def _careful_action(environments: Environments, simulated: int, i: int, only_lines: bool) -> tuple[int, int]:
     """The first candidate that the forecast allows; else nothing."""
     state = environments.state
-    candidate = careful_candidate(state, i, _FIRST)
+    candidate = careful_candidate(state, i, 0)
     while candidate >= 0 and not (only_lines and candidate >= state.line_status.shape[1]):
         kind, target = candidate_action(state, candidate)
         if _forecast_allows(environments, open_environments(simulated), i, kind, target):
@@ -166,13 +165,13 @@ def _careful_action(environments: Environments, simulated: int, i: int, only_lin
 
 @jit
 def _forecast_allows(environments: Environments, trial: Environments, i: int, kind: int, target: int) -> bool:
-    """Whether the careful heuristic may play an action in row ``i``; tried on ``trial``."""
-    copy_environment(environments, i, trial, TRIAL)
-    order_one_change(trial.orders, TRIAL, kind, target)
-    if begin_simulation(trial, environments, i, _NEXT, EXACT) and not dispatch_or_lose(trial, TRIAL):
+    """Whether the careful heuristic may play an action in row ``i``; tried in row 0 of ``trial``."""
+    copy_environment(environments, i, trial, 0)
+    order_one_change(trial.orders, 0, kind, target)
+    if begin_simulation(trial, environments, i, 1, True) and not dispatch_or_lose(trial, 0):
         return False
     finish_simulation(trial)
-    return is_careful_enough(trial.state, TRIAL)
+    return is_careful_enough(trial.state, 0)
 
 
 @jit
@@ -189,7 +188,7 @@ def _remember_moves(state: GridState, orders: Orders, i: int) -> None:
 def _step(environments: Environments, i: int, reward: int, weights: Components, gamma: float) -> None:
     """One grid step and what it is worth."""
     state = environments.state
-    needed = begin_step(environments, i, EXACT)
+    needed = begin_step(environments, i, True)
     if not needed or dispatch_or_lose(environments, i):
         finish_step(environments, i)
     survive, overload, cost = _components(state, i, reward)

@@ -6,7 +6,7 @@ from rl2grid.compile import jit
 from rl2grid.engines.native.environments import open_environments
 from rl2grid.engines.native.generation import set_generators
 from rl2grid.engines.native.simulation import begin_simulation, copy_environment, finish_simulation
-from rl2grid.engines.native.step import EXACT, begin_step, dispatch_or_lose, finish_step, lose_by_dispatch, reset_row
+from rl2grid.engines.native.step import begin_step, dispatch_or_lose, finish_step, lose_by_dispatch, reset_row
 
 
 @jit
@@ -37,7 +37,7 @@ def lose_one(address: int, i: int) -> None:
 def step_one(address: int, i: int) -> None:
     """A whole step of environment ``i`` with exact dispatch."""
     environments = open_environments(address)
-    if begin_step(environments, i, EXACT) and not dispatch_or_lose(environments, i):
+    if begin_step(environments, i, True) and not dispatch_or_lose(environments, i):
         return
     finish_step(environments, i)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rl2grid.compile import int64, jit
+from rl2grid.compile import jit
 from rl2grid.engines.native.environments import Environments
 from rl2grid.engines.native.generation import set_generators
 from rl2grid.engines.native.series import read_forecast
@@ -14,8 +14,6 @@ from rl2grid.mdp.state import GridState
 from rl2grid.structures import copy_row
 
 _FULL_LOAD = np.float32(1.0)
-TRIAL = int64(0)
-"""The row that a simulated step is played in."""
 
 
 @jit
@@ -30,57 +28,55 @@ def copy_environment(source: Environments, i: int, target: Environments, j: int)
 def begin_simulation(
     environments: Environments, real: Environments, row: int, horizon: int, refuse_impossible: bool
 ) -> bool:
-    """Play a simulated step in row :data:`TRIAL` up to the redispatch; whether generators have to be dispatched.
+    """Play a simulated step in row 0 up to the redispatch; whether generators have to be dispatched.
 
-    That row of ``environments`` is a copy of row ``row`` of the ``real`` ones, with the action to be played.
+    Row 0 of ``environments`` is a copy of row ``row`` of the ``real`` ones, with the action to be played.
     Maintenance comes before the agent's action here, and is not forced upon it.
     """
     state = environments.state
-    now = state.step[TRIAL]
+    now = state.step[0]
     _skip_counters_to(environments, horizon)
-    is_legal = judge_order(environments, TRIAL)  # of the topology observed
+    is_legal = judge_order(environments, 0)  # of the topology observed
     _skip_maintenance_to(state, horizon)
-    play_order(environments, TRIAL, is_legal, refuse_impossible)
-    read_forecast(environments, TRIAL, real.hidden, row, now, horizon)
-    state.step[TRIAL] = now + horizon
-    return prepare_dispatch(environments, TRIAL)
+    play_order(environments, 0, is_legal, refuse_impossible)
+    read_forecast(environments, 0, real.hidden, row, now, horizon)
+    state.step[0] = now + horizon
+    return prepare_dispatch(environments, 0)
 
 
 @jit
 def finish_simulation(environments: Environments) -> None:
-    """Play the simulated step from after the redispatch to the observation."""
-    set_generators(environments, TRIAL)
-    run_and_register(environments, TRIAL)
+    """Play the simulated step of row 0 from after the redispatch to the observation."""
+    set_generators(environments, 0)
+    run_and_register(environments, 0)
 
 
 @jit
 def _skip_counters_to(environments: Environments, horizon: int) -> None:
-    """Counters of the trial as Grid2Op sets them for a step ``horizon`` steps ahead."""
+    """Counters of row 0 as Grid2Op sets them for a step ``horizon`` steps ahead."""
     state, hidden = environments.state, environments.hidden
     for line in range(state.rho.shape[1]):
-        state.time_before_cooldown_line[TRIAL, line] = max(
-            state.time_before_cooldown_line[TRIAL, line] - (horizon - 1), 0
-        )
-        if state.rho[TRIAL, line] > _FULL_LOAD:
-            state.timestep_overflow[TRIAL, line] += horizon - 1
-            hidden.protection[TRIAL, line] += horizon - 1
+        state.time_before_cooldown_line[0, line] = max(state.time_before_cooldown_line[0, line] - (horizon - 1), 0)
+        if state.rho[0, line] > _FULL_LOAD:
+            state.timestep_overflow[0, line] += horizon - 1
+            hidden.protection[0, line] += horizon - 1
     for sub in range(state.time_before_cooldown_sub.shape[1]):
-        state.time_before_cooldown_sub[TRIAL, sub] = max(state.time_before_cooldown_sub[TRIAL, sub] - (horizon - 1), 0)
+        state.time_before_cooldown_sub[0, sub] = max(state.time_before_cooldown_sub[0, sub] - (horizon - 1), 0)
 
 
 @jit
 def _skip_maintenance_to(state: GridState, horizon: int) -> None:
-    """Planned outages of the trial as they are ``horizon`` steps ahead; opens the lines that are out then."""
+    """Planned outages of row 0 as they are ``horizon`` steps ahead; opens the lines that are out then."""
     for line in range(state.rho.shape[1]):
-        begin, duration = state.time_next_maintenance[TRIAL, line], state.duration_next_maintenance[TRIAL, line]
+        begin, duration = state.time_next_maintenance[0, line], state.duration_next_maintenance[0, line]
         if begin == -1:
             continue
         if begin + duration <= horizon:
-            state.time_next_maintenance[TRIAL, line] = -1
-            state.duration_next_maintenance[TRIAL, line] = 0
+            state.time_next_maintenance[0, line] = -1
+            state.duration_next_maintenance[0, line] = 0
         elif begin > horizon:
-            state.time_next_maintenance[TRIAL, line] = begin - horizon
+            state.time_next_maintenance[0, line] = begin - horizon
         else:
-            state.time_next_maintenance[TRIAL, line] = 0
-            state.duration_next_maintenance[TRIAL, line] = duration - (horizon - begin)
-            open_line(state, TRIAL, line)
+            state.time_next_maintenance[0, line] = 0
+            state.duration_next_maintenance[0, line] = duration - (horizon - begin)
+            open_line(state, 0, line)

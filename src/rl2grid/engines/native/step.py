@@ -7,7 +7,7 @@
 
 from __future__ import annotations
 
-from rl2grid.compile import boolean, int64, jit
+from rl2grid.compile import jit
 from rl2grid.engines.native.environments import Environments
 from rl2grid.engines.native.generation import (
     begin_generation,
@@ -33,10 +33,7 @@ from rl2grid.mdp.termination import GameOver, game_over_reason
 from rl2grid.powerflow.ac import forget_flow
 from rl2grid.structures import blank_row
 
-_DISPATCH = int64(GameOver.DISPATCH)
-_FIRST, _COUNTED, _UNCOUNTED = int64(0), boolean(True), boolean(False)
-EXACT = boolean(True)
-"""An action does nothing whose redispatch can never be carried out."""
+_DISPATCH = int(GameOver.DISPATCH)
 
 
 @jit
@@ -55,13 +52,13 @@ def reset_row(environments: Environments, i: int) -> None:
     state.time_before_cooldown_sub[i] = 0
     state.timestep_overflow[i] = 0
     _nobody_acts(hidden, i)
-    read_row(environments, i, _FIRST)
-    plan_outages(environments, i, _FIRST)
+    read_row(environments, i, 0)
+    plan_outages(environments, i, 0)
     use_storage(environments, i)
     curtail(environments, i)
     _open_for_maintenance(state, i)
     set_generators(environments, i)
-    if not flow_with_cascade(environments, i, _UNCOUNTED):
+    if not flow_with_cascade(environments, i, False):
         lose(state, i, game_over_by_flow(state, i))
         return
     remember_busbars(environments, i)
@@ -154,7 +151,7 @@ def finish_step(environments: Environments, i: int) -> None:
 def run_and_register(environments: Environments, i: int) -> None:
     """Power flow and cascade, then the counters and the observation; or the game over."""
     state, hidden = environments.state, environments.hidden
-    if not flow_with_cascade(environments, i, _COUNTED):
+    if not flow_with_cascade(environments, i, True):
         lose(state, i, game_over_by_flow(state, i))
         return
     remember_busbars(environments, i)

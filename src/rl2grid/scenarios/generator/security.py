@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rl2grid.arrays import F32, F64, I32, I64
-from rl2grid.compile import int64, jit
+from rl2grid.compile import jit
 from rl2grid.grids import Grid
 from rl2grid.handles import Handle, opener
 from rl2grid.powerflow.ac import CONVERGED, FlowState, new_flow_state, run_flow, write_currents, write_flow
@@ -27,9 +27,8 @@ class _Rows(threading.local):
 
 
 _ROWS = _Rows()
-_ROW = int64(0)
-"""The row that is solved. Engines give the power flow the same types: it is compiled once for all."""
 _open_network, _open_flow = opener(Network), opener(FlowState)
+"""Handles and float64, as the engine has them: the power flow is compiled once for all."""
 
 
 class Verdict(NamedTuple):
@@ -127,10 +126,10 @@ def _assess(
             gen_p[gen] = production[row, gen] / 10.0
             if gen != balancing:
                 balance += production[row, gen]
-        if run_flow(network, flow, _ROW, topology, gen_p, setpoint, load_p, load_q, storage) != CONVERGED:
+        if run_flow(network, flow, 0, topology, gen_p, setpoint, load_p, load_q, storage) != CONVERGED:
             return False
-        write_currents(network, flow, _ROW, current)
-        write_flow(network, flow, _ROW, line_p, solved, gen_angle, load_angle, storage_angle)
+        write_currents(network, flow, 0, current)
+        write_flow(network, flow, 0, line_p, solved, gen_angle, load_angle, storage_angle)
         slack[row] = solved[balancing]
         losses[row] = balance + rounded(10.0 * solved[balancing])
         for line in range(limit.size):
