@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rl2grid.compile import jit
 from rl2grid.streams import Purpose, Stream
 
 
@@ -42,8 +43,14 @@ class Draws:
 
     def uniform(self, size: int) -> NDArray[np.float64]:
         """``size`` numbers in [0, 1)."""
-        key = (self.attempt << 24) | (int(self.channel) << 16) | self.part
+        key = channel_key(self.attempt, int(self.channel), self.part)
         return Stream(self.seed, key, Purpose.SERIES).uniform(size)
+
+
+@jit
+def channel_key(attempt: int, channel: int, part: int) -> int:
+    """The "episode" of a channel's stream (:class:`rl2grid.streams.Stream`)."""
+    return (attempt << 24) | (channel << 16) | part
 
 
 class Portion(NamedTuple):

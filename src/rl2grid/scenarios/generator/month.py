@@ -47,9 +47,14 @@ def raw_month(grid: Grid, seed: int, month: int) -> RawMonth:
     if not isinstance(month, (int, np.integer)) or isinstance(month, bool) or not 0 <= month < MONTHS:
         raise UsageError(f"Month {month!r} does not exist: choose an integer from 0 to {MONTHS - 1}.")
     year = generate_year(grid, seed)
-    first = int(month) * MONTH_STEPS
+    return month_of_year(grid, int(seed), int(month), year.load_p, year.load_q, year.prod_p)
+
+
+def month_of_year(grid: Grid, seed: int, month: int, load_p: I16, load_q: I16, prod_p: I16) -> RawMonth:
+    """A month (0 .. 11) of the series of a year, int16 [row of the year, element]."""
+    first = month * MONTH_STEPS
     rows = slice(first, first + MONTH_ROWS + int(load_constants(grid.id).forecast.horizon[0]))
-    return RawMonth(grid.id, int(seed), int(month), year.load_p[rows], year.load_q[rows], year.prod_p[rows])
+    return RawMonth(grid.id, seed, month, load_p[rows], load_q[rows], prod_p[rows])
 
 
 def scenario_of(grid: Grid, raw: RawMonth) -> Scenario:
@@ -81,7 +86,7 @@ def start_of(raw: RawMonth) -> datetime:
 def arrays_of(grid: Grid, raw: RawMonth) -> dict[str, NDArray[Any]]:
     """The arrays of a month's scenario by name; read-only, contiguous, float32."""
     constants = load_constants(grid.id)
-    integers = [array.astype(np.int32) for array in (raw.load_p, raw.load_q, raw.prod_p)]
+    integers = raw.load_p, raw.load_q, raw.prod_p
     forecasts = make_forecasts(grid, constants, raw.seed, raw.month, *integers)
     arrays: dict[str, NDArray[Any]] = {
         name: (array[:MONTH_ROWS] / 10.0).astype(np.float32)

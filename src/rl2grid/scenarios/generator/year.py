@@ -28,7 +28,8 @@ from rl2grid.scenarios.generator.security import assess
 MAX_SEED = 2**63 - 1
 LONGEST_HORIZON = ROWS_PER_HOUR
 """Rows after the year that its last forecasts need."""
-_ROWS = YEAR_ROWS + LONGEST_HORIZON
+YEAR_LENGTH = YEAR_ROWS + LONGEST_HORIZON
+"""Rows of a generated year."""
 _ATTEMPTS = 8
 _SPARE_DAYS = 60
 """Other years of the seed from which a first day may be taken."""
@@ -94,7 +95,7 @@ def generate_year(grid: Grid, seed: int) -> Year:
         raise UsageError(f"Seed {seed!r} is no seed of a year: choose an integer from 0 to {MAX_SEED}.")
     constants = load_constants(grid.id)
     for attempt in range(_ATTEMPTS):
-        market = new_market(grid, constants, Portion(int(seed), attempt, 0, _ROWS))
+        market = new_market(grid, constants, Portion(int(seed), attempt, 0, YEAR_LENGTH))
         year = _attempt_year(_Setting(grid, constants, int(seed), attempt, market))
         if year is not None:
             for array in (year.load_p, year.load_q, year.prod_p):
@@ -104,7 +105,7 @@ def generate_year(grid: Grid, seed: int) -> Year:
 
 
 def _attempt_year(setting: _Setting) -> Year | None:
-    demand, renewables = _draw(setting, Portion(setting.seed, setting.attempt << 8, 0, _ROWS))
+    demand, renewables = _draw(setting, Portion(setting.seed, setting.attempt << 8, 0, YEAR_LENGTH))
     spares = np.zeros(MONTHS, np.int64)
     doubtful = np.arange(MONTHS)
     sample: _Sample | None = None
