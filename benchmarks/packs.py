@@ -26,9 +26,11 @@ import numpy as np
 from rl2grid.grids import GRID_IDS, Grid, load_grid
 from rl2grid.scenarios import cache, generated, library
 from rl2grid.scenarios.episodes import plan_episode
+from rl2grid.scenarios.fingerprint import VERSION
 from rl2grid.scenarios.generator.month import arrays_of
 from rl2grid.scenarios.library import load_scenario
 from rl2grid.scenarios.making import make_packs
+from rl2grid.scenarios.month_names import MONTHS, month_name, parse_months
 from rl2grid.scenarios.packs import read_raw
 from rl2grid.scenarios.published import MANIFEST, held_out_months, listed_hashes
 from rl2grid.scenarios.splits import SPLIT_VERSION
@@ -47,9 +49,9 @@ SETTLING = 2.5
 
 def measure(grid: Grid) -> dict[str, Any]:
     """Sizes in bytes, times in milliseconds: the median of :data:`REPEATS`."""
-    list(make_packs(grid, [(SEED, month) for month in range(generated.MONTHS)], workers=1))
-    packs = [generated.pack_path(grid, SEED, month) for month in range(generated.MONTHS)]
-    name = f"generated/{generated.month_name(SEED, 7)}"
+    list(make_packs(grid, [(SEED, month) for month in range(MONTHS)], workers=1))
+    packs = [generated.pack_path(grid, SEED, month) for month in range(MONTHS)]
+    name = f"generated/{month_name(SEED, 7)}"
     raw = read_raw(packs[7])
     first = milliseconds(lambda: open_new(grid, name), expand_again)
     time.sleep(SETTLING)
@@ -105,7 +107,7 @@ def once(work: Callable[[], object]) -> float:
 
 def publish(grid: Grid, workers: int | None) -> dict[str, str]:
     """Hashes of the held-out months, which are made where they are not there."""
-    months = [generated.parse_months(name) for name in held_out_months()]
+    months = [parse_months(name) for name in held_out_months()]
     for done in make_packs(grid, [(each.seed, each.first) for each in months], workers):
         print(f"\r{grid.id}: {done} of {len(months)} months", end="", flush=True)
     print()
@@ -128,7 +130,7 @@ def main() -> None:
     for grid in map(load_grid, arguments.grids):
         if arguments.command == "manifest":
             path = Path(str(resources.files("rl2grid.scenarios") / MANIFEST))
-            record(path, f"{generated.VERSION} {SPLIT_VERSION}", grid.id, publish(grid, arguments.workers))
+            record(path, f"{VERSION} {SPLIT_VERSION}", grid.id, publish(grid, arguments.workers))
             continue
         with tempfile.TemporaryDirectory() as folder:
             os.environ["RL2GRID_DATA"] = folder

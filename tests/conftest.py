@@ -7,8 +7,10 @@ from grid2op_copies import made_once
 
 from rl2grid.compile_notices import VARIABLE
 from rl2grid.engines.reference import engine
+from rl2grid.scenarios.making import MAKERS
 
 os.environ[VARIABLE] = "1"  # what commands print is compared, whether or not something was compiled before
+os.environ[MAKERS] = "0"  # tests need few years of training, and all cores
 
 
 @pytest.fixture(scope="session", autouse=True)

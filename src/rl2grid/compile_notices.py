@@ -52,7 +52,7 @@ class Notices:
             if self._began is None:
                 self._began = self._told = time.monotonic()
                 self._functions = 0
-                _say(f"compiling {part} for this machine, once per installation; this may take a minute or two.")
+                say(f"compiling {part} for this machine, once per installation; this may take a minute or two.")
 
     def _end(self, part: str) -> None:
         with self._lock:
@@ -61,7 +61,7 @@ class Notices:
             self._ended = time.monotonic()
             if self._began is not None and self._ended - self._told >= _PROGRESS_SECONDS:
                 self._told = self._ended
-                _say(f"still compiling {part}: {self._counted} in {self._ended - self._began:.0f} s so far.")
+                say(f"still compiling {part}: {self._counted} in {self._ended - self._began:.0f} s so far.")
             if self._depth == 0:
                 self._timer = threading.Timer(_PAUSE_SECONDS, self.finish)
                 self._timer.daemon = True
@@ -73,7 +73,7 @@ class Notices:
             if self._depth or self._began is None:
                 return
             seconds, self._began = self._ended - self._began, None
-            _say(f"compiled {self._counted} in {seconds:.1f} s.")
+            say(f"compiled {self._counted} in {seconds:.1f} s.")
 
     @property
     def _counted(self) -> str:
@@ -93,7 +93,8 @@ def _part(event: Any) -> str | None:
     return _PARTS.get(".".join(module.split(".")[:2]), "rl2grid")
 
 
-def _say(words: str) -> None:
+def say(words: str) -> None:
+    """A line on standard error, unless nothing is to be said."""
     if VARIABLE not in os.environ and sys.stderr is not None:
         print(f"rl2grid: {words}", file=sys.stderr, flush=True)
 

@@ -11,7 +11,7 @@ from rl2grid.analysis import scenario_check
 from rl2grid.analysis.scenario_check import HEADINGS, Comparison, autocorrelation, compare, distance, measure
 from rl2grid.errors import UsageError
 from rl2grid.grids import load_grid
-from rl2grid.scenarios.generated import VERSION
+from rl2grid.scenarios.fingerprint import VERSION
 from rl2grid.scenarios.library import load_scenario
 
 BUS14 = load_grid("bus14")

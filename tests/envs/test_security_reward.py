@@ -15,8 +15,8 @@ def make(**keywords):
 
 def test_the_weighted_score_is_added():
     plain, scored = make(), SecurityReward(make(), weight=0.5)
-    plain.reset(seed=4)
-    scored.reset(seed=4)
+    plain.reset(seed=3)
+    scored.reset(seed=3)
     scores = set()
     for action in (0, 5, 0, 5):
         expected, mine = plain.step(action), scored.step(action)

@@ -35,7 +35,7 @@ from rl2grid.records.episodes import EPISODES_FILE, Episode
 from rl2grid.records.evaluation_folder import PARTIAL_FILE
 from rl2grid.records.evaluations import EVALUATION_FILE, Evaluation, load_evaluation
 from rl2grid.records.files import DamageWarning
-from rl2grid.scenarios.generated import VERSION
+from rl2grid.scenarios.fingerprint import VERSION
 from rl2grid.scenarios.library import list_scenarios
 from rl2grid.training.request import hyperparameters
 

@@ -21,9 +21,10 @@ from rl2grid.scenarios import generated, library, packs
 from rl2grid.scenarios.cache import data_folder
 from rl2grid.scenarios.episodes import MAX_STEPS, EpisodePlan, maintenance_matrix, plan_episode
 from rl2grid.scenarios.generator import month as generator
-from rl2grid.scenarios.library import load_scenario
+from rl2grid.scenarios.library import load_scenario, open_series
+from rl2grid.scenarios.month_names import parse_months
 from rl2grid.scenarios.series_hash import hash_of_series
-from rl2grid.scenarios.splits import FIRST_TRAINING_SEED, HELD_OUT_SPLITS, TRAINING_SEEDS
+from rl2grid.scenarios.splits import HELD_OUT_SPLITS
 
 BUS14 = load_grid("bus14")
 MONTH_STEPS = 8064
@@ -192,53 +193,12 @@ def test_months_to_remove_are_looked_for_when_some_were_expanded_not_at_every_ep
     assert looked == [1, 3]
 
 
-def test_training_keeps_whole_years_and_forgets_the_oldest(made, monkeypatch) -> None:
-    old, new = FIRST_TRAINING_SEED + 1, FIRST_TRAINING_SEED + 2
-    load_scenario("bus14", "generated/17-03")
-    load_scenario("bus14", f"generated/{old}-03+04")
-    assert sorted(made[1:]) == [(old, month) for month in range(12)]
-    monkeypatch.setattr(generated, "TRAINING_PACK_BYTES", 1)
-    load_scenario("bus14", f"generated/{new}-03+04")
-    kept = [path.stem for path in generated.pack_folder(BUS14).glob("*.pack")]
-    assert len(kept) == 2
-    assert "17-03" in kept
-    assert any(name.startswith(str(new)) for name in kept)
-
-
 @pytest.mark.parametrize(
     "name", ["7", "17-12", "17-3", "17-03+05", "17-11+12", "-1-03", "017-03", "1e3-03", f"{10**19}-03", "17-03+"]
 )
 def test_names_of_nothing_are_refused(name: str) -> None:
     with pytest.raises(UsageError, match="must look like 17-03"):
         load_scenario("bus14", f"generated/{name}")
-
-
-def test_training_draws_years_from_its_own_range() -> None:
-    drawn = [
-        generated.parse_months(generated.draw_training_months(seed, number))
-        for seed in range(500)
-        for number in range(40)
-    ]
-    assert all(generated.is_training_seed(each.seed) for each in drawn)
-    assert FIRST_TRAINING_SEED + TRAINING_SEEDS <= 2**63
-    assert generated.is_training_seed(FIRST_TRAINING_SEED)
-    assert not generated.is_training_seed(FIRST_TRAINING_SEED - 1)
-    counts = np.bincount([each.first for each in drawn], minlength=12)
-    assert counts[11] == 0
-    np.testing.assert_allclose(counts[:11] / len(drawn), 1 / 11, atol=0.01)
-
-
-def test_episodes_in_a_row_and_neighbouring_seeds_play_one_year() -> None:
-    years = np.array(
-        [
-            [generated.parse_months(generated.draw_training_months(seed, number)).seed for number in range(36)]
-            for seed in range(48)
-        ]
-    )
-    blocks = years.reshape(3, 16, 3, 12)
-    assert (blocks == blocks[:, :1, :, :1]).all()
-    assert len(np.unique(years)) == 9
-    assert len({generated.draw_training_months(seed, 0) for seed in range(16)}) > 4
 
 
 def test_training_plans_start_anywhere_and_go_on_in_the_next_month(made) -> None:
@@ -250,6 +210,7 @@ def test_training_plans_start_anywhere_and_go_on_in_the_next_month(made) -> None
     assert max(starts) > MONTH_STEPS / 2 > min(starts)
     chosen = plan_episode(BUS14, "train", 5, 0, start=7)
     assert (chosen.scenario_id, chosen.start) == (plans[0].scenario_id, 7)
+    assert open_series("bus14", plans[0].scenario_id).n_rows == 2 * MONTH_STEPS + 1
     scenario = load_scenario("bus14", plans[0].scenario_id)
     assert maintenance_matrix(BUS14, scenario, plans[0]).shape == (2 * MONTH_STEPS + 1, BUS14.n_line)
 
@@ -278,6 +239,6 @@ def test_both_engines_play_the_same_month(made) -> None:
         observations = [env.reset(seed=0)[0]] + [env.step(0)[0] for _ in range(30)]
         played[engine] = np.array(observations)
         env.close()
-    assert made == [generated.parse_months(HELD_OUT_SPLITS["validation"][0])[:2]]
+    assert made == [parse_months(HELD_OUT_SPLITS["validation"][0])[:2]]
     np.testing.assert_allclose(played["native"], played["reference"], rtol=1e-4, atol=1e-4)
     assert np.ptp(played["native"], axis=0).any()

@@ -14,6 +14,7 @@ from rl2grid.cli import data
 from rl2grid.cli.main import main
 from rl2grid.grids import GRID_IDS, load_grid
 from rl2grid.scenarios import generated, library, published
+from rl2grid.scenarios.fingerprint import VERSION
 from rl2grid.scenarios.library import load_scenario
 from rl2grid.scenarios.making import make_packs
 from rl2grid.scenarios.packs import read_raw
@@ -32,7 +33,7 @@ def manifest(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, str]]:
         pass
     hashes = {name: str(hash_pack(BUS14, name)) for name in NAMES}
     monkeypatch.setattr(published, "HELD_OUT_SPLITS", {"test": NAMES})
-    version = f"{generated.VERSION} {SPLIT_VERSION}"
+    version = f"{VERSION} {SPLIT_VERSION}"
     monkeypatch.setattr(published, "_manifest", lambda: {version: {"bus14": {"test": hashes["17-03"][:8] + 8 * "0"}}})
     monkeypatch.setattr(published, "_warned", set())
     library._load_generated_scenario.cache_clear()
@@ -93,15 +94,15 @@ def test_making_names_what_differs(manifest, capsys, monkeypatch) -> None:
 def test_the_published_manifest_is_of_the_held_out_months() -> None:
     file = Path(published.__file__).with_name(published.MANIFEST)
     manifest = json.loads(file.read_text())
-    assert set(manifest) == {f"{generated.VERSION} {SPLIT_VERSION}"}
-    assert set(manifest[f"{generated.VERSION} {SPLIT_VERSION}"]) <= set(GRID_IDS)
-    for hashes in map(published.published_hashes, manifest[f"{generated.VERSION} {SPLIT_VERSION}"]):
+    assert set(manifest) == {f"{VERSION} {SPLIT_VERSION}"}
+    assert set(manifest[f"{VERSION} {SPLIT_VERSION}"]) <= set(GRID_IDS)
+    for hashes in map(published.published_hashes, manifest[f"{VERSION} {SPLIT_VERSION}"]):
         assert set(hashes) == set(published.held_out_months())
         assert all(re.fullmatch("[0-9a-f]{8}", each) for each in hashes.values())
 
 
 def test_what_is_to_be_published_is_what_is_read_back(manifest, monkeypatch) -> None:
-    version = f"{generated.VERSION} {SPLIT_VERSION}"
+    version = f"{VERSION} {SPLIT_VERSION}"
     listed = published.listed_hashes(BUS14)
     monkeypatch.setattr(published, "_manifest", lambda: {version: {"bus14": listed}})
     published.published_hashes.cache_clear()

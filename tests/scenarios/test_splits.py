@@ -5,28 +5,30 @@ import pytest
 
 from rl2grid.errors import UsageError
 from rl2grid.grids import GRID_IDS, load_grid
-from rl2grid.scenarios import generated, months
+from rl2grid.scenarios import months
 from rl2grid.scenarios.episodes import MAX_STEPS, plan_episode
+from rl2grid.scenarios.fingerprint import VERSION
 from rl2grid.scenarios.library import generator_version, list_scenarios, scenario_pack_hash, split_version
-from rl2grid.scenarios.splits import FIRST_TRAINING_SEED, HELD_OUT_SPLITS, SPLIT_VERSION, SPLITS
+from rl2grid.scenarios.month_names import parse_months
+from rl2grid.scenarios.splits import FIRST_TRAINING_SEED, HELD_OUT_SPLITS, SPLIT_VERSION, SPLITS, TRAINING_SEEDS
 
 BUS14 = load_grid("bus14")
 HELD_OUT = ("validation", "test")
 
 
 def test_held_out_months_are_of_other_years_and_never_of_training() -> None:
-    months = {split: [generated.parse_months(name) for name in names] for split, names in HELD_OUT_SPLITS.items()}
+    months = {split: [parse_months(name) for name in names] for split, names in HELD_OUT_SPLITS.items()}
     assert {split: len(names) for split, names in months.items()} == {"validation": 200, "test": 500}
     seeds = [each.seed for split in months.values() for each in split]
     assert len(set(seeds)) == 700
     assert max(seeds) < FIRST_TRAINING_SEED
-    assert not any(map(generated.is_training_seed, seeds))
+    assert not set(seeds) & set(TRAINING_SEEDS)
     assert not set(seeds) & {*range(10_000, 20_000), *range(700_000, 700_020), *range(800_000, 800_020)}, "used before"
 
 
 @pytest.mark.parametrize("split", HELD_OUT)
 def test_the_first_months_of_a_list_are_balanced_over_the_seasons(split: str) -> None:
-    months = [generated.parse_months(name) for name in HELD_OUT_SPLITS[split]]
+    months = [parse_months(name) for name in HELD_OUT_SPLITS[split]]
     assert all(each.n_months == 1 for each in months)
     for n in range(1, len(months) + 1):
         per_month = np.bincount([each.first for each in months[:n]], minlength=12)
@@ -39,7 +41,9 @@ def test_the_first_months_of_a_list_are_balanced_over_the_seasons(split: str) ->
 def test_splits_are_listed_where_they_end(grid_id: str) -> None:
     for split in HELD_OUT:
         assert list_scenarios(grid_id, split) == tuple(f"generated/{name}" for name in HELD_OUT_SPLITS[split])
-    with pytest.raises(UsageError, match="has no end, and its months cannot be listed: choose one of validation, "):
+    with pytest.raises(
+        UsageError, match="is a library that episodes are drawn from, not a list: choose one of validation, "
+    ):
         list_scenarios(grid_id, "train")
 
 
@@ -76,7 +80,7 @@ def test_results_name_the_generator_and_what_was_played(monkeypatch: pytest.Monk
     assert scenario_pack_hash("bus14", "validation", first) not in hashes
     for split, text in zip(SPLITS, hashes, strict=True):
         version, _, digest = text.rpartition("-")
-        assert version == ("" if split == "bundled" else generated.VERSION)
+        assert version == ("" if split == "bundled" else VERSION)
         assert len(digest) == 16
         assert generator_version("bus14", split) == (version or None)
         assert split_version("bus14", split) == (SPLIT_VERSION if split in HELD_OUT else None)

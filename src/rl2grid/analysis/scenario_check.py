@@ -25,9 +25,10 @@ from rl2grid.arrays import F64
 from rl2grid.drawing.theme import DARK, LIGHT, Theme, style
 from rl2grid.errors import UsageError
 from rl2grid.grids import STEPS_PER_HOUR, Grid, find_system
-from rl2grid.scenarios.generated import MONTHS, VERSION, generator_fingerprint, month_name
+from rl2grid.scenarios.fingerprint import VERSION, generator_fingerprint
 from rl2grid.scenarios.generator.security import assess
 from rl2grid.scenarios.library import list_scenarios, load_scenario
+from rl2grid.scenarios.month_names import MONTHS, month_name
 from rl2grid.scenarios.scenario import STEP, Scenario
 
 SOURCES = ("bundled", "generated")

@@ -34,8 +34,9 @@ from rl2grid.scenarios.export import export_scenario
 from rl2grid.scenarios.full import VARIABLE, full_data_folder
 from rl2grid.scenarios.library import import_folder, load_scenario
 from rl2grid.scenarios.making import make_packs
+from rl2grid.scenarios.month_names import MONTHS, month_name, parse_months
 from rl2grid.scenarios.progress import Report
-from rl2grid.scenarios.splits import HELD_OUT_SPLITS
+from rl2grid.scenarios.splits import HELD_OUT_SPLITS, TRAIN, TRAINING_SEEDS
 
 ALL_MONTHS = "0-11"
 REFUSED = 1
@@ -83,7 +84,7 @@ def _add_make(actions: Any) -> None:
     parser.add_argument("grid", help="for example bus14")
     wanted = parser.add_mutually_exclusive_group(required=True)
     wanted.add_argument("--seed", type=int, default=None, help="seed of the year")
-    wanted.add_argument("--split", default=None, choices=tuple(HELD_OUT_SPLITS), help="months of a split")
+    wanted.add_argument("--split", default=None, choices=(TRAIN, *HELD_OUT_SPLITS), help="months of a split")
     parser.add_argument(
         "--months",
         default=None,
@@ -101,9 +102,12 @@ def _make(options: argparse.Namespace, output: Output) -> int:
         task = bar.add_task(f"Making months of {grid.id}", total=len(months))
         for done in make_packs(grid, months, workers):
             bar.update(task, completed=done)
-    output.results(grid=grid.id, months=len(months), folder=generated.pack_folder(grid))
-    output.remark(f"{len(months)} months of {grid.id} are in {generated.pack_folder(grid)}.")
-    _compare_with_published(output, grid, [generated.month_name(*month) for month in months])
+    folder = data_folder() if options.split == TRAIN else generated.pack_folder(grid)
+    output.results(grid=grid.id, months=len(months), folder=folder)
+    output.remark(f"{len(months):,} months of {grid.id} are in {folder}.")
+    if options.split == TRAIN:
+        return 0
+    _compare_with_published(output, grid, [month_name(*month) for month in months])
     return 0
 
 
@@ -112,11 +116,15 @@ def _wanted_months(options: argparse.Namespace) -> list[tuple[int, int]]:
         if not 0 <= options.seed < 2**63:
             raise UsageError(f"Seed {options.seed} is no seed of a year: choose an integer from 0 to 2^63 - 1.")
         return [(options.seed, month) for month in _month_numbers(options.months or ALL_MONTHS)]
+    if options.split == TRAIN:
+        if options.months is not None:
+            raise UsageError("Training months are made a year at a time, all of them: leave --months out.")
+        return [(seed, month) for seed in TRAINING_SEEDS for month in range(MONTHS)]
     names = HELD_OUT_SPLITS[options.split]
     number = options.months or str(len(names))
     if not number.isdecimal() or not 1 <= int(number) <= len(names):
         raise UsageError(f"The split {options.split} has no first {number} months: choose from 1 to {len(names)}.")
-    months = [generated.parse_months(name) for name in names[: int(number)]]
+    months = [parse_months(name) for name in names[: int(number)]]
     return [(each.seed, each.first) for each in months]
 
 
@@ -128,7 +136,7 @@ def _month_numbers(text: str) -> list[int]:
             numbers |= set(range(int(first), int(last or first) + 1))
     except ValueError:
         numbers = set()
-    if not numbers or not numbers <= set(range(generated.MONTHS)):
+    if not numbers or not numbers <= set(range(MONTHS)):
         raise UsageError(f"Months {text!r} do not exist: give numbers from 0 to 11, as 0-11 or 0,3,6.")
     return sorted(numbers)
 

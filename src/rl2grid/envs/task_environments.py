@@ -34,7 +34,7 @@ from rl2grid.mdp.observations import observation_writer
 from rl2grid.mdp.rewards import resolve_reward, reward_name
 from rl2grid.mdp.state import GridState
 from rl2grid.scenarios.episodes import EpisodePlan, plan_episode
-from rl2grid.scenarios.library import load_scenario
+from rl2grid.scenarios.library import open_series
 from rl2grid.scenarios.scenario import STEP
 
 if TYPE_CHECKING:
@@ -212,8 +212,7 @@ class TaskEnvironments:
         self._position(i)
         plan = self._plans[i]
         assert plan is not None
-        scenario = load_scenario(self.grid.id, plan.scenario_id)
-        return scenario.start_datetime + (plan.start + step) * STEP
+        return open_series(self.grid.id, plan.scenario_id).start_datetime + (plan.start + step) * STEP
 
     def what_if(self, i: int, actions: Sequence[int] | None) -> ActionOutcomes:
         """What each action would do in the next step; see :meth:`PowerGridEnv.what_if`."""

@@ -81,7 +81,6 @@ _KINDS = ("stressed", "near", "calm")
 _SHARES = {"stressed": 0.7, "near": 0.15, "calm": 0.15}
 _PER_EPISODE = {"stressed": 6, "near": 2, "calm": 2}
 _EPISODE_STEPS = 2016  # a week
-_EPISODES_PER_YEAR = 4  # making a year takes longer than playing a week of it
 _POLICIES = ("nothing", "recovering", "greedy", "recovering", "disturbed", "recovering")
 _TRIED_BY_GREEDY = 1000
 _COVERED, _WORTHWHILE = 0.9, 0.02
@@ -400,9 +399,7 @@ def _is_sound(file: Path) -> bool:
 def _play(laboratory: _Laboratory, seed: int, number: int) -> _Episode:
     """Play one episode; of each kind the operating points to keep are drawn from all of its steps."""
     engine, policy = laboratory.engine, _POLICIES[number % len(_POLICIES)]
-    plan = plan_episode(
-        laboratory.grid, "train", _episode_seed(seed, number // _EPISODES_PER_YEAR), number % _EPISODES_PER_YEAR
-    )
+    plan = plan_episode(laboratory.grid, "train", _episode_seed(seed, number), number)
     draws, choices = Stream(seed, number, Purpose.AGENT), Stream(seed, number, Purpose.START)
     engine.reset(0, plan)
     state = engine.state

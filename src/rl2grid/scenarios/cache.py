@@ -60,6 +60,11 @@ def data_folder() -> Path:
     return Path(os.environ.get("RL2GRID_DATA") or platformdirs.user_cache_dir("rl2grid")).expanduser()
 
 
+def series_folder(grid_id: str) -> Path:
+    """Where the copies of a grid's series are."""
+    return data_folder() / "series" / f"v{FORMAT_VERSION}" / grid_id
+
+
 def cached_series(grid_id: str, name: str, key: str, build: Callable[[], FolderContent]) -> CachedSeries:
     """The series ``name`` of a grid, made by ``build`` where no sound copy of it exists.
 
@@ -67,17 +72,16 @@ def cached_series(grid_id: str, name: str, key: str, build: Callable[[], FolderC
         UsageError: The data folder cannot be written; or what ``build`` raises.
     """
     _allow_many_files()
-    folder = data_folder() / "series" / f"v{FORMAT_VERSION}" / grid_id
-    stem = folder / f"{name.replace('/', '.')}-{key[:16]}"
-    data, manifest = stem.with_name(stem.name + ".npy"), stem.with_name(stem.name + ".json")
+    data = _data_path(grid_id, name, key)
+    manifest = data.with_suffix(".json")
     series = _read(data, manifest)
     if series is not None:
         return series
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        data.parent.mkdir(parents=True, exist_ok=True)
         import filelock  # here: importing rl2grid shall not take long
 
-        with filelock.FileLock(stem.with_name(stem.name + ".lock")):
+        with filelock.FileLock(data.with_suffix(".lock")):
             series = _read(data, manifest) or _make(data, manifest, build())
     except OSError as error:
         if error.errno == errno.EMFILE:
@@ -89,6 +93,16 @@ def cached_series(grid_id: str, name: str, key: str, build: Callable[[], FolderC
             f"The data folder {data_folder()} cannot be written ({error}): set RL2GRID_DATA to one that can."
         ) from error
     return series
+
+
+def is_cached(grid_id: str, name: str, key: str) -> bool:
+    """Whether there is a copy of a series; it is not looked at."""
+    return _data_path(grid_id, name, key).with_suffix(".json").is_file()
+
+
+def _data_path(grid_id: str, name: str, key: str) -> Path:
+    stem = f"{name.replace('/', '.')}-{key[:16]}"
+    return series_folder(grid_id) / f"{stem}.npy"
 
 
 @functools.cache
@@ -113,7 +127,7 @@ def remove_damaged(grid_id: str) -> list[Path]:
     Raises:
         UsageError: A damaged copy cannot be removed.
     """
-    copies = sorted((data_folder() / "series" / f"v{FORMAT_VERSION}" / grid_id).glob("[!.]*.npy"))
+    copies = sorted(series_folder(grid_id).glob("[!.]*.npy"))
     try:
         return [data for data in copies if not _matches(data) and _remove(data)]
     except OSError as error:

@@ -6,18 +6,21 @@ All of it is a function of the seed and the episode's number, and of nothing els
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid, find_system
-from rl2grid.scenarios.library import check_in_split, draw_scenario, load_scenario
+from rl2grid.scenarios.library import check_in_split, draw_scenario, open_series
 from rl2grid.scenarios.maintenance import clipped_outages, matrix_of, outages_of, sample_outages
 from rl2grid.scenarios.scenario import Scenario
 from rl2grid.scenarios.splits import TRAIN
 from rl2grid.streams import Purpose, Stream
+
+if TYPE_CHECKING:
+    from rl2grid.scenarios.training_years import TrainingMonths
 
 MAX_STEPS = 8064
 """Steps of a completed episode where the series is that long: four weeks (paper, Section 4)."""
@@ -64,10 +67,10 @@ def plan_episode(
 ) -> EpisodePlan:
     """Decide episode ``number`` of the stream of episodes of ``seed``.
 
-    Training draws a year, a month of it and a row of that month, again where nothing done overloads a line in that row
-    (in the reference topology, with everything in service), and the episode goes on in the next month; of the full
-    dataset, a scenario and a row with enough left to play (:data:`MIN_TRAINING_STEPS`). The other splits are
-    enumerated: episode ``number`` of seed ``seed`` plays scenario ``seed + number`` of the list (beginning again at
+    Training draws a year of the library, a month of it and a row of that month, again where nothing done overloads a
+    line in that row (in the reference topology, with everything in service), and the episode goes on in the next month;
+    of the full dataset, a scenario and a row with enough left to play (:data:`MIN_TRAINING_STEPS`). The other splits
+    are enumerated: episode ``number`` of seed ``seed`` plays scenario ``seed + number`` of the list (beginning again at
     its end) from row 0. ``scenario`` and ``start`` replace what would be drawn and leave every other draw as it was.
 
     Raises:
@@ -77,7 +80,7 @@ def plan_episode(
         check_in_split(grid.id, split, scenario)
     else:
         scenario = draw_scenario(grid.id, split, seed, number)
-    series = load_scenario(grid.id, scenario)
+    series = open_series(grid.id, scenario)
     redraws = 0
     if start is None:
         start, redraws = _draw_start(grid, series, seed, number) if split == TRAIN else _Start(0, 0)
@@ -91,7 +94,7 @@ def admissible_starts(n_steps: int) -> int:
     return n_steps - min(MIN_TRAINING_STEPS, (n_steps + 1) // 2) + 1
 
 
-def planned_outages(grid: Grid, scenario: Scenario, plan: EpisodePlan) -> NDArray[np.int32]:
+def planned_outages(grid: Grid, scenario: Scenario | TrainingMonths, plan: EpisodePlan) -> NDArray[np.int32]:
     """The planned outages of an episode.
 
     Recorded ones where the scenario records them; else sampled as the grid samples them, or, in generated months of
@@ -119,7 +122,7 @@ def maintenance_matrix(grid: Grid, scenario: Scenario, plan: EpisodePlan) -> NDA
     return matrix_of(planned_outages(grid, scenario, plan), scenario.n_rows, grid.n_line)
 
 
-def _draw_start(grid: Grid, series: Scenario, seed: int, number: int) -> _Start:
+def _draw_start(grid: Grid, series: Scenario | TrainingMonths, seed: int, number: int) -> _Start:
     starts = admissible_starts(series.n_steps)
     stream = Stream(seed, number, Purpose.START)
     if series.source != "generated":
@@ -132,16 +135,18 @@ def _draw_start(grid: Grid, series: Scenario, seed: int, number: int) -> _Start:
     return _Start(0, MAX_REDRAWS)
 
 
-def _is_secure(grid: Grid, series: Scenario, row: int) -> bool:
+def _is_secure(grid: Grid, series: Scenario | TrainingMonths, row: int) -> bool:
     """Whether no line is overloaded in a row, in the reference topology with everything in service."""
     # Imported where it is needed: compiling takes long, and planning recorded series compiles nothing.
+    from rl2grid.scenarios.generator.constants import load_constants
     from rl2grid.scenarios.generator.security import assess
 
-    load_p, load_q, prod_p = (
-        np.rint(10 * array[row : row + 1]).astype(np.int32) for array in (series.load_p, series.load_q, series.prod_p)
-    )
-    voltage = None if series.prod_v is None else np.array(series.prod_v[row])
-    verdict = assess(grid, voltage, load_p, load_q, prod_p)
+    if isinstance(series, Scenario):
+        tenths = [np.rint(10 * array[row : row + 1]) for array in (series.load_p, series.load_q, series.prod_p)]
+    else:
+        tenths = [*series.rows(row, row + 1)]
+    load_p, load_q, prod_p = (array.astype(np.int32) for array in tenths)
+    verdict = assess(grid, load_constants(grid.id).voltage, load_p, load_q, prod_p)
     return verdict.converged and bool(verdict.loading[0] <= 1)
 
 

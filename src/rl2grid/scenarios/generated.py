@@ -4,111 +4,42 @@
 episode that starts late in a month goes on in the next. A month that was made is kept as a small file, its pack, in
 the data folder, and expanded into the memory-mapped copies that all series have. Everything kept can be made again
 from its name: packs are filed under a fingerprint of the generator, so that those of another generator are never
-read; a damaged one is made again; of what training has drawn only the latest is kept.
+read; a damaged one is made again. Months of the library that training plays are kept with their whole years
+(:mod:`rl2grid.scenarios.training_years`).
 """
 
 from __future__ import annotations
 
-import functools
-import hashlib
 import itertools
-import json
-import re
 from collections.abc import Sequence
 from dataclasses import fields
-from importlib import resources
-from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import filelock
 import numpy as np
 from numpy.typing import NDArray
 
 from rl2grid.errors import UsageError
-from rl2grid.grids import Grid, System, find_system
+from rl2grid.grids import Grid
 from rl2grid.scenarios.cache import FORMAT_VERSION, CachedSeries, cached_series, data_folder
+from rl2grid.scenarios.fingerprint import generator_fingerprint
 from rl2grid.scenarios.folder import FolderContent
+from rl2grid.scenarios.month_names import Months, month_name, parse_months
 from rl2grid.scenarios.scenario import Scenario
-from rl2grid.scenarios.splits import FIRST_TRAINING_SEED, TRAINING_SEEDS
-from rl2grid.streams import Purpose, Stream
+from rl2grid.scenarios.splits import TRAINING_SEEDS
 
 if TYPE_CHECKING:
     from rl2grid.scenarios.generator.month import RawMonth
-
-VERSION = "2"
-"""Version of the generator, named by every result on generated months: it changes with any value that is generated.
-The hashes of the months of validation and test are published with it (:mod:`rl2grid.scenarios.published`)."""
-
-MONTHS = 12
-SEEDS_PER_YEAR, EPISODES_PER_YEAR = 16, 12
-"""How many seeds in a row, and how many training episodes of each in a row, play the same year (from rows of their
-own): making one month takes as long as making its year, and environments of a vector have seeds in a row."""
 
 EXPANDED_BYTES = 8 * 2**30
 """Expanded generated months beyond this are removed, oldest first; they are expanded again when needed."""
 MONTHS_BETWEEN_CLEANUPS = 50
 """A process looks for months to remove after the first one that it expands, then each time after so many more: to look
 at thousands of files takes longer than to play an episode."""
-TRAINING_PACK_BYTES = 2 * 2**30
-"""Packs of a grid's training years beyond this are removed, oldest first."""
-
-_POWER_FLOW = ("ac", "bits", "factors", "flow_state", "model", "newton", "ordering", "topology")
-"""Modules of :mod:`rl2grid.powerflow` that decide what is generated."""
-
-_NAME = re.compile(r"(?P<seed>0|[1-9]\d{0,18})-(?P<month>\d\d)(\+(?P<next>\d\d))?")
 _LOCKS = 64
 _EXPANDED_MONTHS = itertools.count()
 """How many this process has expanded so far."""
-
-
-class Months(NamedTuple):
-    """One month, or two in a row, of the year of a seed."""
-
-    seed: int
-    first: int
-    n_months: int
-
-    @property
-    def numbers(self) -> range:
-        """The months, 0 .. 11."""
-        return range(self.first, self.first + self.n_months)
-
-
-def parse_months(name: str) -> Months:
-    """The months that ``name`` stands for.
-
-    Raises:
-        UsageError: It stands for none.
-    """
-    match = _NAME.fullmatch(name)
-    if match is not None:
-        first = int(match["month"])
-        last = first if match["next"] is None else int(match["next"])
-        if last < MONTHS and (match["next"] is None or last == first + 1):
-            return Months(int(match["seed"]), first, last - first + 1)
-    raise UsageError(
-        f"Generated scenario {name!r} does not exist: it must look like 17-03 (seed, and month 00 to 11), or 17-03+04 "
-        "for two months in a row."
-    )
-
-
-def month_name(seed: int, month: int) -> str:
-    """For example ``17-03``."""
-    return f"{seed}-{month:02d}"
-
-
-def draw_training_months(seed: int, number: int) -> str:
-    """Name of the two months in a row in which training episode ``number`` of ``seed`` is played."""
-    year = Stream(seed // SEEDS_PER_YEAR, number // EPISODES_PER_YEAR, Purpose.SCENARIO).integer(TRAINING_SEEDS)
-    # The second number of the stream: the first may be the one that draws a year.
-    month = int(Stream(seed, number, Purpose.SCENARIO).uniform(2)[1] * (MONTHS - 1))
-    return f"{month_name(FIRST_TRAINING_SEED + year, month)}+{month + 1:02d}"
-
-
-def is_training_seed(seed: int) -> bool:
-    """Whether training may play the year of ``seed``."""
-    return FIRST_TRAINING_SEED <= seed < FIRST_TRAINING_SEED + TRAINING_SEEDS
 
 
 def load_generated(grid: Grid, name: str) -> CachedSeries:
@@ -131,28 +62,6 @@ def load_generated(grid: Grid, name: str) -> CachedSeries:
     return series
 
 
-def generator_fingerprint(grid: Grid) -> str:
-    """Short hash of everything that decides what the generator makes for ``grid``."""
-    return _fingerprint(find_system(grid.id))
-
-
-@functools.lru_cache(maxsize=64)
-def _fingerprint(system: System) -> str:
-    package = resources.files("rl2grid")
-    sources = [
-        *(package / "powerflow" / f"{module}.py" for module in _POWER_FLOW),
-        *_python_files(package / "scenarios" / "generator"),
-        package / "scenarios" / "packs.py",
-        package / "grids" / "network.py",
-        package / "streams.py",
-    ]
-    constants = json.dumps(system.required_constants(), sort_keys=True)
-    digest = hashlib.sha256(f"{system.hash} {constants}".encode())
-    for source in sources:
-        digest.update(source.read_bytes())
-    return digest.hexdigest()[:16]
-
-
 def pack_folder(grid: Grid) -> Path:
     """Where the packs of this generator are kept."""
     return data_folder() / "packs" / grid.id / generator_fingerprint(grid)
@@ -163,8 +72,17 @@ def pack_path(grid: Grid, seed: int, month: int) -> Path:
     return pack_folder(grid) / f"{month_name(seed, month)}.pack"
 
 
+def is_stored(grid: Grid, seed: int, month: int) -> bool:
+    """Whether a month was made; its values are not looked at."""
+    if seed not in TRAINING_SEEDS:
+        return pack_path(grid, seed, month).is_file()
+    from rl2grid.scenarios.training_years import is_year_there
+
+    return is_year_there(grid, seed)
+
+
 def make_months(grid: Grid, seed: int, months: Sequence[int]) -> None:
-    """Make the packs of months of one year, those that are not there.
+    """Make the packs of months of one year, those that are not there; of the library, the year.
 
     Raises:
         UsageError: the data folder cannot be written.
@@ -192,6 +110,8 @@ def _stored_hash(grid: Grid, seed: int, month: int) -> str | None:
     """The hash in the head of a pack; None where there is no sound pack of that month."""
     from rl2grid.scenarios import packs
 
+    if seed in TRAINING_SEEDS:
+        return packs.hash_of_month(_read_or_make(grid, seed, [month])[0])
     try:
         head = packs.read_head(pack_path(grid, seed, month))
     except UsageError:
@@ -217,7 +137,12 @@ def _in_order(arrays: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
 
 
 def _read_or_make(grid: Grid, seed: int, months: Sequence[int]) -> list[RawMonth]:
-    """Months of one year, from their packs; those without a sound one are made."""
+    """Months of one year, from their packs or the library; those without a sound one are made."""
+    if seed in TRAINING_SEEDS:
+        # Imported where it is needed, as the generator is.
+        from rl2grid.scenarios.training_years import training_raw_month
+
+        return [training_raw_month(grid, seed, month) for month in months]
     found = [_read(grid, seed, month) for month in months]
     if None not in found:
         return [raw for raw in found if raw is not None]
@@ -236,21 +161,12 @@ def _read_or_make(grid: Grid, seed: int, months: Sequence[int]) -> list[RawMonth
         raise UsageError(
             f"The data folder {data_folder()} cannot be written ({error}): set RL2GRID_DATA to one that can."
         ) from error
-    if is_training_seed(seed):
-        packs = [path for path in folder.glob("*.pack") if is_training_seed(_seed_of(path))]
-        _remove_oldest(packs, TRAINING_PACK_BYTES)
     return made
 
 
 def _make_missing(grid: Grid, seed: int, months: Sequence[int]) -> None:
     for month in months:
         if _read(grid, seed, month) is None:
-            _make(grid, seed, month)
-    if not is_training_seed(seed):
-        return
-    # The year is at hand, and its other months are likely to be drawn next.
-    for month in range(MONTHS):
-        if not pack_path(grid, seed, month).is_file():
             _make(grid, seed, month)
 
 
@@ -291,10 +207,6 @@ def _remove_leftovers(folder: Path, seed: int) -> None:
         path.unlink(missing_ok=True)
 
 
-def _seed_of(path: Path) -> int:
-    return parse_months(path.stem).seed
-
-
 def _remove_oldest(paths: list[Path], limit: int) -> None:
     """Remove files, the latest excepted, until the rest takes at most ``limit`` bytes."""
     status = []
@@ -311,7 +223,3 @@ def _remove_oldest(paths: list[Path], limit: int) -> None:
         for companion in (path, *(path.with_suffix(suffix) for suffix in (".json", ".lock"))):
             companion.unlink(missing_ok=True)
         excess -= size
-
-
-def _python_files(package: Traversable) -> list[Traversable]:
-    return sorted((file for file in package.iterdir() if file.name.endswith(".py")), key=lambda file: file.name)

@@ -9,12 +9,13 @@ import filelock
 
 from rl2grid.grids import Grid, find_system
 from rl2grid.scenarios.bundled import bundled_folders
-from rl2grid.scenarios.cache import data_folder
+from rl2grid.scenarios.cache import data_folder, series_folder
 from rl2grid.scenarios.full import full_data_folder
-from rl2grid.scenarios.generated import pack_folder, pack_lock, pack_path, parse_months
+from rl2grid.scenarios.generated import is_stored, pack_folder, pack_lock, pack_path
 from rl2grid.scenarios.imported import imported_folder, imported_names
+from rl2grid.scenarios.month_names import parse_months
 from rl2grid.scenarios.recorded import RecordedScenarios
-from rl2grid.scenarios.splits import HELD_OUT_SPLITS
+from rl2grid.scenarios.splits import HELD_OUT_SPLITS, TRAINING_SEEDS
 
 CACHES = ("series", "packs")
 """Folders below the data folder whose content is made again when needed."""
@@ -25,7 +26,7 @@ class StoredSeries(NamedTuple):
 
     grid_id: str
     kind: str
-    """``bundled``, ``recorded``, ``generated``, ``imported`` or ``full``."""
+    """``bundled``, ``recorded``, ``training``, ``generated``, ``imported`` or ``full``."""
     what: str
     """In words."""
     size: int
@@ -121,6 +122,20 @@ def _recorded(grid: Grid) -> list[StoredSeries]:
 def _generated(grid: Grid) -> list[StoredSeries]:
     if find_system(grid.id).constants is None:
         return []
+    return [*_library(grid), *_packs(grid)]
+
+
+def _library(grid: Grid) -> list[StoredSeries]:
+    """The years that training plays."""
+    years = sum(is_stored(grid, seed, 0) for seed in TRAINING_SEEDS)
+    if not years:
+        return []
+    files = list(series_folder(grid.id).glob("year.*.npy"))
+    what = f"{years} of {len(TRAINING_SEEDS)} years of training"
+    return [StoredSeries(grid.id, "training", what, sum(path.stat().st_size for path in files), series_folder(grid.id))]
+
+
+def _packs(grid: Grid) -> list[StoredSeries]:
     folder = pack_folder(grid)
     packs = list(folder.glob("*.pack"))
     if not packs:

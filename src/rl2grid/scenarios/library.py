@@ -14,6 +14,7 @@ import weakref
 from collections import deque
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rl2grid.errors import UsageError, one_of
 from rl2grid.grids import Grid, System, find_system
@@ -22,13 +23,17 @@ from rl2grid.scenarios.bundled import interconnections
 from rl2grid.scenarios.cache import data_folder
 from rl2grid.scenarios.folder import read_folder
 from rl2grid.scenarios.full import full_data_folder
-from rl2grid.scenarios.generated import parse_months, series_hash
+from rl2grid.scenarios.generated import series_hash
 from rl2grid.scenarios.imported import imported_names, load_imported, store_imported
 from rl2grid.scenarios.making import make_packs
+from rl2grid.scenarios.month_names import Months, parse_months
 from rl2grid.scenarios.progress import Report, ignore
 from rl2grid.scenarios.published import warn_of_deviation
 from rl2grid.scenarios.scenario import Scenario
-from rl2grid.scenarios.splits import HELD_OUT_SPLITS, SPLIT_VERSION, SPLITS
+from rl2grid.scenarios.splits import HELD_OUT_SPLITS, SPLIT_VERSION, SPLITS, TRAINING_SEEDS
+
+if TYPE_CHECKING:
+    from rl2grid.scenarios.training_years import TrainingMonths
 
 IMPORTED = "folder"
 """Source of imported series."""
@@ -41,7 +46,7 @@ def list_scenarios(grid_id: str, split: str) -> tuple[str, ...]:
     """Ids of the scenarios of a split, in the order in which an evaluation plays them.
 
     Raises:
-        UsageError: Unknown grid or split, the split has no end, or the full dataset is requested and has none.
+        UsageError: Unknown grid or split, the split is drawn from, or the full dataset is requested and has none.
     """
     system = find_system(grid_id)
     _check_split(split)
@@ -82,6 +87,22 @@ def load_scenario(grid_id: str, scenario_id: str) -> Scenario:
     return _load_scenario(system, scenario_id, data_folder(), full_data_folder())
 
 
+def open_series(grid_id: str, scenario_id: str) -> Scenario | TrainingMonths:
+    """What an episode is played on: of the library of training years the months where they lie, else the scenario.
+
+    Raises:
+        UsageError: as :func:`load_scenario`.
+    """
+    months = _library_months(scenario_id)
+    system = find_system(grid_id)
+    if months is None or "generated" not in system.scenarios.sources(system.grid):
+        return load_scenario(grid_id, scenario_id)
+    # Imported where it is needed: compiling takes long, and playing recorded series compiles no generator.
+    from rl2grid.scenarios.training_years import training_months
+
+    return training_months(system.grid, months)
+
+
 def import_folder(grid: Grid, path: Path, report: Report = ignore) -> Scenario:
     """Any Grid2Op scenario folder as a scenario of ``grid``, checked and copied to the data folder.
 
@@ -105,9 +126,8 @@ def import_folder(grid: Grid, path: Path, report: Report = ignore) -> Scenario:
 def scenario_pack_hash(grid_id: str, split: str, scenarios: Sequence[str] | None = None) -> str:
     """Short hash of every value of scenarios of a split: of those given, else of all.
 
-    Of generated months it begins with the version of the generator, as in ``1-0123456789abcdef``. Their training has
-    no end: without ``scenarios``, its hash covers the rule by which months are drawn and the first month that training
-    with seed 0 plays.
+    Of generated months it begins with the version of the generator, as in ``1-0123456789abcdef``. Of training, without
+    ``scenarios``, it covers the version of the library and the first months that seed 0 plays.
 
     Raises:
         UsageError: Unknown grid, split or scenario.
@@ -142,7 +162,7 @@ def make_scenarios(grid_id: str, scenarios: Sequence[str], workers: int | None =
 
 
 def split_version(grid_id: str, split: str) -> str | None:
-    """Version of the list of a split; None: it is a list of recorded series, or has no end."""
+    """Version of the list of a split; None: it is a list of recorded series, or is drawn from."""
     return SPLIT_VERSION if split in HELD_OUT_SPLITS and generator_version(grid_id, split) is not None else None
 
 
@@ -156,6 +176,14 @@ def _content_hash(system: System, scenario_id: str) -> str:
     if scenario_id.startswith(_GENERATED):
         return series_hash(system.grid, _series_of(scenario_id))
     return load_scenario(system.id, scenario_id).content_hash
+
+
+def _library_months(scenario_id: str) -> Months | None:
+    """The months of the library that an id stands for; None: it stands for something else, or for a part of them."""
+    if not scenario_id.startswith(_GENERATED) or "[" in scenario_id:
+        return None
+    months = parse_months(scenario_id.removeprefix(_GENERATED))
+    return months if months.seed in TRAINING_SEEDS else None
 
 
 def _series_of(scenario_id: str) -> str:

@@ -11,8 +11,9 @@ from rl2grid.grids import STEPS_PER_HOUR, MaintenanceConfig
 from rl2grid.scenarios.scenario import STEP
 from rl2grid.streams import Stream
 
-_ROWS_PER_DAY = 24 * STEPS_PER_HOUR
-_SATURDAY = 5
+ROWS_PER_DAY = 24 * STEPS_PER_HOUR
+SATURDAY = 5
+"""Of the weekdays, of which 0 is Monday."""
 
 
 def sample_outages(
@@ -29,17 +30,17 @@ def sample_outages(
     Returns:
         int32 [outage, 3]: line, first row, row after the last; by line and row.
     """
-    weekday, month = _calendar(start_datetime, n_rows)
+    weekday, month = calendar_of(start_datetime, n_rows)
     lines = np.array(config.lines, np.int64)
     draws = stream.uniform(len(month) * 2 * len(lines)).reshape(len(month), 2, len(lines))
     chance, priority = draws[:, 0], draws[:, 1]
-    drawn = (chance < np.array(config.monthly_daily_probability)[month, None]) & (weekday < _SATURDAY)[:, None]
+    drawn = (chance < np.array(config.monthly_daily_probability)[month, None]) & (weekday < SATURDAY)[:, None]
     ranked = np.argsort(np.where(drawn, priority, 2.0), axis=1, kind="stable")
     most = np.minimum(drawn.sum(axis=1), np.array(config.monthly_max_per_day, np.int64)[month])
     kept = np.zeros_like(drawn)
     np.put_along_axis(kept, ranked, np.arange(len(lines)) < most[:, None], axis=1)
     day, which = np.nonzero(kept)
-    first = day * _ROWS_PER_DAY
+    first = day * ROWS_PER_DAY
     begin, end = first + config.start_hour * STEPS_PER_HOUR, first + config.end_hour * STEPS_PER_HOUR
     return clipped_outages(np.stack([lines[which], begin, end], axis=1), 0, n_rows)
 
@@ -119,7 +120,7 @@ def _next_row(flags: NDArray[np.bool_]) -> NDArray[np.int64]:
     return result
 
 
-def _calendar(start_datetime: datetime, n_rows: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def calendar_of(start_datetime: datetime, n_rows: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Weekday (0 is Monday) and month (0 .. 11) of the calendar dates that a series touches, except the last."""
     first, last = start_datetime.date(), (start_datetime + (n_rows - 1) * STEP).date()
     dates = np.datetime64(first) + np.arange((last - first).days)

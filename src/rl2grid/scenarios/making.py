@@ -1,25 +1,36 @@
 """Months made ahead of their use, by several processes, each a year at a time.
 
-Months that are missing are otherwise made one by one where they are first asked for.
+Months that are missing are otherwise made one by one where they are first asked for. Of the library of training years,
+what is missing is made beside the training that plays what is there (:func:`make_library_beside`).
 """
 
 from __future__ import annotations
 
+import atexit
+import functools
 import os
 import pickle
 import queue
 import subprocess
 import sys
 import threading
-from collections.abc import Iterable, Iterator
-from typing import NamedTuple
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import NamedTuple, Protocol
 
+from rl2grid import compile_notices
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid, System, find_system
 from rl2grid.grids.systems import add_system
 from rl2grid.processes import kill, take_standard_streams
-from rl2grid.scenarios.generated import make_months, pack_path
+from rl2grid.scenarios.cache import data_folder
+from rl2grid.scenarios.generated import is_stored, make_months
+from rl2grid.scenarios.month_names import MONTHS
+from rl2grid.scenarios.splits import TRAINING_SEEDS
 
+MAKERS = "RL2GRID_MAKERS"
+"""Environment variable: how many processes make the library of training years beside a training; 0 for none, by default
+one per core but one, and at least one."""
 FEW_YEARS = 6
 """So many are made sooner by one process than others have started."""
 
@@ -28,12 +39,76 @@ _MAKER = "from rl2grid.scenarios.making import main; main()"
 _ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 
 
+_IDLE_MAKER = f"import os; hasattr(os, 'nice') and os.nice(19); {_MAKER}"
+"""Takes what time others leave."""
+
+
 class Year(NamedTuple):
     """Months of the year of one seed, which are made together."""
 
     seed: int
     months: tuple[int, ...]
     """0 .. 11."""
+
+
+class Years(Protocol):
+    """What there is to make."""
+
+    def get_nowait(self) -> Year:
+        """The next year.
+
+        Raises:
+            queue.Empty: there is none left.
+        """
+
+
+def make_library_beside(grid: Grid) -> None:
+    """Begin to make what is missing of the library of training years, once per process, in idle processes of their own.
+
+    Who plays a year that is not there yet makes it, or waits for who does: nothing depends on how far they are. They
+    end with this process.
+    """
+    _make_beside(grid, data_folder())
+
+
+@functools.lru_cache(maxsize=64)
+def _make_beside(grid: Grid, data: Path) -> None:
+    missing = _MissingYears(grid)
+    number = _number_of_makers()
+    if not number or not missing:
+        return
+    ignored: queue.SimpleQueue[int | str] = queue.SimpleQueue()  # who plays the year will meet what is wrong
+    system, quiet = find_system(grid.id), {compile_notices.VARIABLE: "1"}
+    for _ in range(number):
+        atexit.register(_Maker(system, missing, ignored, _IDLE_MAKER, quiet).stop)
+
+
+def _number_of_makers() -> int:
+    given = os.environ.get(MAKERS)
+    if given is None:
+        return max((os.cpu_count() or 1) - 1, 1)
+    if not given.isdecimal():
+        raise UsageError(f"{MAKERS}={given} is no number of processes: set it to 0 or more.")
+    return int(given)
+
+
+class _MissingYears:
+    """Years of the library that are not there when somebody asks for the next to make."""
+
+    def __init__(self, grid: Grid) -> None:
+        self._grid = grid
+        self._seeds = iter(TRAINING_SEEDS)
+        self._lock = threading.Lock()
+
+    def __bool__(self) -> bool:
+        return not all(is_stored(self._grid, seed, 0) for seed in TRAINING_SEEDS)
+
+    def get_nowait(self) -> Year:
+        with self._lock:
+            for seed in self._seeds:
+                if not is_stored(self._grid, seed, 0):
+                    return Year(seed, tuple(range(MONTHS)))
+        raise queue.Empty
 
 
 def make_packs(grid: Grid, months: Iterable[tuple[int, int]], workers: int | None = None) -> Iterator[int]:
@@ -51,7 +126,7 @@ def make_packs(grid: Grid, months: Iterable[tuple[int, int]], workers: int | Non
         UsageError: the data folder cannot be written, or a process could not make its months.
     """
     asked = sorted(set(months))
-    missing = [month for month in asked if not pack_path(grid, *month).is_file()]
+    missing = [month for month in asked if not is_stored(grid, *month)]
     done = len(asked) - len(missing)
     yield done
     seeds = dict.fromkeys(seed for seed, _ in missing)
@@ -76,7 +151,7 @@ def _made_elsewhere(grid: Grid, years: list[Year], workers: int) -> Iterator[int
     for year in years:
         waiting.put(year)
     made: queue.SimpleQueue[int | str] = queue.SimpleQueue()
-    makers = [_Maker(find_system(grid.id), waiting, made) for _ in range(min(workers, len(years)))]
+    makers = [_Maker(find_system(grid.id), waiting, made, _MAKER, {}) for _ in range(min(workers, len(years)))]
     left = sum(len(year.months) for year in years)
     try:
         while left:
@@ -93,12 +168,19 @@ def _made_elsewhere(grid: Grid, years: list[Year], workers: int) -> Iterator[int
 class _Maker:
     """A process that makes years, and the thread that asks it for them."""
 
-    def __init__(self, system: System, waiting: queue.SimpleQueue[Year], made: queue.SimpleQueue[int | str]) -> None:
+    def __init__(
+        self,
+        system: System,
+        waiting: Years,
+        made: queue.SimpleQueue[int | str],
+        script: str,
+        variables: Mapping[str, str],
+    ) -> None:
         self._process = subprocess.Popen(
-            [sys.executable, "-c", _MAKER],
+            [sys.executable, "-c", script],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            env=os.environ | _ONE_THREAD,
+            env={**os.environ, **_ONE_THREAD, **variables},
         )
         self._thread = threading.Thread(target=self._ask, args=(system, waiting, made), daemon=True)
         self._thread.start()
@@ -107,7 +189,7 @@ class _Maker:
         """End the process, whatever it is doing; what it was writing is not kept."""
         kill(self._process, self._thread)
 
-    def _ask(self, system: System, waiting: queue.SimpleQueue[Year], made: queue.SimpleQueue[int | str]) -> None:
+    def _ask(self, system: System, waiting: Years, made: queue.SimpleQueue[int | str]) -> None:
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         try:

@@ -12,24 +12,20 @@ from dataclasses import dataclass
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid, MaintenanceConfig, load_grid
 from rl2grid.grids.systems import Scenarios, Series
+from rl2grid.scenarios.fingerprint import VERSION
 from rl2grid.scenarios.full import is_full_requested
-from rl2grid.scenarios.generated import (
-    EPISODES_PER_YEAR,
-    SEEDS_PER_YEAR,
-    VERSION,
-    draw_training_months,
-    is_training_seed,
-    load_generated,
-    parse_months,
-)
+from rl2grid.scenarios.generated import load_generated
+from rl2grid.scenarios.month_names import name_of, parse_months
 from rl2grid.scenarios.splits import (
     BUNDLED,
     FIRST_TRAINING_SEED,
     HELD_OUT_SPLITS,
+    LIBRARY_VERSION,
     SPLITS,
     TRAIN,
     TRAINING_SEEDS,
     draw_listed,
+    draw_training_months,
     require_listed,
 )
 
@@ -53,7 +49,7 @@ class GeneratedScenarios:
             return self.recorded.listed(grid, split)
         if split == TRAIN:
             raise UsageError(
-                f"The split {split} has no end, and its months cannot be listed: choose one of "
+                f"The split {split} is a library that episodes are drawn from, not a list: choose one of "
                 f"{', '.join(other for other in SPLITS if other != split)}."
             )
         return tuple(f"{GENERATED}/{name}" for name in HELD_OUT_SPLITS[split])
@@ -66,17 +62,17 @@ class GeneratedScenarios:
             require_listed(grid, split, self.listed(grid, split), scenario_id)
             return
         source, _, name = scenario_id.partition("/")
-        if source != GENERATED or not is_training_seed(parse_months(name).seed):
+        if source != GENERATED or parse_months(name).seed not in TRAINING_SEEDS:
             raise UsageError(
                 f"Scenario {scenario_id!r} is not in the split {TRAIN} of {grid.id}: choose one such as "
-                f"{GENERATED}/{FIRST_TRAINING_SEED}-03, with a seed of at least {FIRST_TRAINING_SEED}."
+                f"{GENERATED}/{FIRST_TRAINING_SEED}-03, with a seed from {FIRST_TRAINING_SEED} to {TRAINING_SEEDS[-1]}."
             )
 
     def draw(self, grid: Grid, split: str, seed: int, number: int) -> str:
         if not _is_generated(split):
             return self.recorded.draw(grid, split, seed, number)
         if split == TRAIN:
-            return f"{GENERATED}/{draw_training_months(seed, number)}"
+            return f"{GENERATED}/{name_of(draw_training_months(seed, number))}"
         return draw_listed(self.listed(grid, split), split, seed, number)
 
     def load(self, grid: Grid, source: str, name: str) -> Series:
@@ -87,8 +83,7 @@ class GeneratedScenarios:
             return self.recorded.sample(grid, split)
         if split != TRAIN:
             return "", self.listed(grid, split)
-        rule = f"{FIRST_TRAINING_SEED} {TRAINING_SEEDS} {SEEDS_PER_YEAR} {EPISODES_PER_YEAR}\n"
-        return rule, (f"{GENERATED}/{draw_training_months(0, 0)}",)
+        return f"library {LIBRARY_VERSION}\n", (f"{GENERATED}/{name_of(draw_training_months(0, 0))}",)
 
     def maintenance(self, grid: Grid, source: str) -> MaintenanceConfig:
         if source != GENERATED:

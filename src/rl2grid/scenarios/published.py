@@ -17,7 +17,9 @@ from typing import NamedTuple
 
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
-from rl2grid.scenarios.generated import VERSION, pack_path, parse_months
+from rl2grid.scenarios.fingerprint import VERSION
+from rl2grid.scenarios.generated import pack_path
+from rl2grid.scenarios.month_names import parse_months
 from rl2grid.scenarios.scenario import Scenario
 from rl2grid.scenarios.series_hash import hash_of_series
 from rl2grid.scenarios.splits import HELD_OUT_SPLITS, SPLIT_VERSION

@@ -1,10 +1,10 @@
 """How the generated months are split for learning and testing.
 
 A month is named by the seed of its year and its number, ``17-03``. Validation is a list of 200 months and test one of
-500, each month of another year, and the first N of a list are balanced over the seasons; training draws the seeds of
-its years from a range in which those lists have none, and has no end. Seeds from 10,000 to 19,999 were used to
-calibrate the generator; other seeds below :data:`FIRST_TRAINING_SEED` that are in no list are free. The lists were
-drawn after the generator was frozen.
+500, each month of another year, and the first N of a list are balanced over the seasons; training draws from the
+months of a library of years, whose seeds are in neither list. Seeds from 10,000 to 19,999 were used to calibrate the
+generator; other seeds below :data:`FIRST_TRAINING_SEED` that are in no list are free. The lists were drawn after the
+generator was frozen.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from types import MappingProxyType
 
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
+from rl2grid.scenarios.month_names import MONTHS, Months
 from rl2grid.streams import Purpose, Stream
 
 TRAIN, VALIDATION, TEST, BUNDLED = "train", "validation", "test", "bundled"
@@ -25,8 +26,18 @@ Grid2Op wheel, days to months of each grid."""
 FIRST_TRAINING_SEED = 1_000_000
 """Training plays years of this seed and above; validation and test those of seeds below it."""
 
-TRAINING_SEEDS = 2**40
-"""How many seeds training draws from."""
+TRAINING_YEARS = 96
+"""Years of the library. Two months in a row begin in 11 of the months of each: 1,056 scenarios."""
+
+TRAINING_SEEDS = range(FIRST_TRAINING_SEED, FIRST_TRAINING_SEED + TRAINING_YEARS)
+"""Of the years of the library."""
+
+LIBRARY_VERSION = "1"
+"""Version of the library and of how training draws from it."""
+
+YEARS_FOR_FIRST = (4, 24)
+"""From so many years the first and the second episode of a seed are drawn, later ones from all: a training on an empty
+data folder begins while the other years are made."""
 
 SPLIT_VERSION = "2"
 """Version of the lists of validation and test, named by every result on them. The first version, 20 months each, was
@@ -48,6 +59,17 @@ VALIDATION_MONTHS = 20
 """Of the list, in each validation of a training, of which there are many."""
 
 _SHOWN = 20
+
+
+def years_for(number: int) -> int:
+    """From how many years of the library episode ``number`` of a seed is drawn: the first so many."""
+    return YEARS_FOR_FIRST[number] if number < len(YEARS_FOR_FIRST) else TRAINING_YEARS
+
+
+def draw_training_months(seed: int, number: int) -> Months:
+    """The two months in a row in which training episode ``number`` of ``seed`` is played."""
+    year, month = Stream(seed, number, Purpose.SCENARIO).uniform(2)
+    return Months(FIRST_TRAINING_SEED + int(year * years_for(number)), int(month * (MONTHS - 1)), 2)
 
 
 def draw_listed(ids: Sequence[str], split: str, seed: int, number: int) -> str:

@@ -1,0 +1,220 @@
+"""The library of years whose months training plays.
+
+It has :data:`~rl2grid.scenarios.splits.TRAINING_YEARS` years, each of which is one file in the data folder: the
+integers that the generator makes, 0.1 MW and 0.1 MVAr, which engines read where they lie, mapped into memory. A year is
+made when an episode first plays it. Forecasts are made for the rows in which somebody asks for them.
+"""
+
+from __future__ import annotations
+
+import functools
+import shutil
+import threading
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rl2grid import compile_notices
+from rl2grid.arrays import F32, I16
+from rl2grid.errors import UsageError
+from rl2grid.grids import Grid
+from rl2grid.handles import Handle
+from rl2grid.scenarios.cache import cached_series, data_folder, is_cached
+from rl2grid.scenarios.fingerprint import generator_fingerprint
+from rl2grid.scenarios.folder import FolderContent
+from rl2grid.scenarios.generator.calendar import MONTH_STEPS, month_start
+from rl2grid.scenarios.generator.constants import load_constants
+from rl2grid.scenarios.generator.forecast import ForecastModel, forecast_model, forecast_row
+from rl2grid.scenarios.generator.month import RawMonth, month_of_year
+from rl2grid.scenarios.generator.year import YEAR_LENGTH, generate_year
+from rl2grid.scenarios.month_names import Months, name_of
+from rl2grid.scenarios.splits import TRAINING_SEEDS, TRAINING_YEARS
+
+_ARRAYS = ("load_p", "load_q", "prod_p")
+
+
+class TrainingYear(NamedTuple):
+    """The series of a year, read-only and mapped into memory: 0.1 MW and 0.1 MVAr."""
+
+    load_p: I16
+    """int16 [row, load]."""
+    load_q: I16
+    """int16 [row, load]."""
+    prod_p: I16
+    """int16 [row, gen]."""
+    content_hash: str
+    """SHA-256 of all values."""
+
+
+class ForecastInMemory(NamedTuple):
+    """What makes the forecasts of a grid's months."""
+
+    model: Handle[ForecastModel]
+    voltage: F32 | None
+    """Set-points, kV, float32 [gen]; None: those of the grid file hold."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingMonths:
+    """Months of a year of the library, in a row; attributes are those of a :class:`Scenario` where it has them."""
+
+    id: str
+    grid: Grid
+    months: Months
+    year: TrainingYear
+    source: str = "generated"
+    first_row: int = 0
+    maintenance: None = None
+    """Nothing is recorded of planned outages."""
+
+    @property
+    def n_steps(self) -> int:
+        """Steps that can be played from row 0."""
+        return self.months.n_months * MONTH_STEPS
+
+    @property
+    def n_rows(self) -> int:
+        """Number of rows."""
+        return self.n_steps + 1
+
+    @property
+    def series_rows(self) -> int:
+        """They are a whole series."""
+        return self.n_rows
+
+    @property
+    def start_datetime(self) -> datetime:
+        """Time stamp of row 0."""
+        return month_start(load_constants(self.grid.id).year, self.months.first)
+
+    @property
+    def series_start_datetime(self) -> datetime:
+        """They are a whole series."""
+        return self.start_datetime
+
+    @property
+    def content_hash(self) -> str:
+        """Names every value, through those of the year."""
+        return f"{self.year.content_hash}-{self.months.first:02d}-{self.months.n_months}"
+
+    @property
+    def first_row_of_year(self) -> int:
+        """Row of the year that is row 0."""
+        return self.months.first * MONTH_STEPS
+
+    def rows(self, first: int, stop: int) -> tuple[I16, I16, I16]:
+        """Rows ``first`` to ``stop - 1``: active and reactive demand, production; 0.1 MW, int16 [row, element]."""
+        part = slice(self.first_row_of_year + first, self.first_row_of_year + stop)
+        return self.year.load_p[part], self.year.load_q[part], self.year.prod_p[part]
+
+    def month_and_row(self, row: int) -> tuple[int, int]:
+        """The month (0 .. 11) that forecasts in a row, and which row of that month it is."""
+        month = min(row // MONTH_STEPS, self.months.n_months - 1)
+        return self.months.first + month, row - month * MONTH_STEPS
+
+    def forecasts(self, row: int) -> tuple[F32, F32, F32]:
+        """What a row forecasts: active and reactive demand, production; MW, float32 [horizon, element]."""
+        model = forecasts_of(self.grid).model.structure
+        horizon = int(model.horizon[0])
+        month, local = self.month_and_row(row)
+        load_p, load_q, prod_p = self.rows(row + 1, row + 1 + horizon)
+        forecast = (
+            np.empty(load_p.shape, np.float32),
+            np.empty(load_q.shape, np.float32),
+            np.empty(prod_p.shape, np.float32),
+        )
+        for k in range(horizon):
+            rows = load_p[k], load_q[k], prod_p[k], *(out[k] for out in forecast)
+            forecast_row(model, self.months.seed, month, local, k + 1, *rows)
+        return forecast
+
+
+def training_months(grid: Grid, months: Months) -> TrainingMonths:
+    """Months of the library; the year is made where it is not there.
+
+    Raises:
+        UsageError: the data folder cannot be written, or has no room for the library.
+    """
+    return TrainingMonths(f"generated/{name_of(months)}", grid, months, training_year(grid, months.seed))
+
+
+def training_raw_month(grid: Grid, seed: int, month: int) -> RawMonth:
+    """A month of the library as the generator makes it; errors as :func:`training_months`."""
+    year = training_year(grid, seed)
+    return month_of_year(grid, seed, month, year.load_p, year.load_q, year.prod_p)
+
+
+def training_year(grid: Grid, seed: int) -> TrainingYear:
+    """A year of the library, made where it is not there; asking again gives the same arrays.
+
+    Raises:
+        UsageError: the data folder cannot be written, or has no room for the library.
+    """
+    with _LOCK:
+        return _open_year(grid, seed, data_folder(), generator_fingerprint(grid))
+
+
+def is_year_there(grid: Grid, seed: int) -> bool:
+    """Whether a year was made; its values are not looked at."""
+    return is_cached(grid.id, _file(seed), generator_fingerprint(grid))
+
+
+def year_bytes(grid: Grid) -> int:
+    """What a year takes on disk, a few kilobytes aside."""
+    return YEAR_LENGTH * (2 * grid.n_load + grid.n_gen) * np.dtype(np.int16).itemsize
+
+
+@functools.cache
+def forecasts_of(grid: Grid) -> ForecastInMemory:
+    """What makes the forecasts of the months of a grid."""
+    constants = load_constants(grid.id)
+    return ForecastInMemory(Handle(forecast_model(grid, constants)), constants.voltage)
+
+
+_LOCK = threading.Lock()
+
+
+@functools.lru_cache(maxsize=8 * TRAINING_YEARS)
+def _open_year(grid: Grid, seed: int, data: Path, fingerprint: str) -> TrainingYear:
+    def make() -> FolderContent:
+        _check_room(grid, data)
+        year = generate_year(grid, seed)
+        arrays: dict[str, Any] = {name: getattr(year, name) for name in _ARRAYS}
+        return FolderContent(month_start(load_constants(grid.id).year, 0), arrays)
+
+    series = cached_series(grid.id, _file(seed), fingerprint, make)
+    load_p, load_q, prod_p = (series.arrays[name] for name in _ARRAYS)
+    return TrainingYear(load_p, load_q, prod_p, series.content_hash)
+
+
+def _file(seed: int) -> str:
+    return f"year.{seed}"
+
+
+def _check_room(grid: Grid, data: Path) -> None:
+    """Refuse a library that does not fit, before any of what is missing is written."""
+    missing = sum(not is_year_there(grid, seed) for seed in TRAINING_SEEDS) * year_bytes(grid)
+    free = shutil.disk_usage(data).free
+    if missing > free:
+        raise UsageError(
+            f"The library of training months of {grid.id} takes {_gigabytes(TRAINING_YEARS * year_bytes(grid))} in "
+            f"{data}, of which {_gigabytes(missing)} are still to be written, and {_gigabytes(free)} are free: free "
+            "some, or set RL2GRID_DATA to a folder with more room."
+        )
+    _announce(grid, data)
+
+
+@functools.lru_cache(maxsize=64)
+def _announce(grid: Grid, data: Path) -> None:
+    """Say once what disk is going to be used."""
+    compile_notices.say(
+        f"making the {TRAINING_YEARS} years of which training on {grid.id} plays the months, as they are needed and "
+        f"once only: {_gigabytes(TRAINING_YEARS * year_bytes(grid))} in {data}."
+    )
+
+
+def _gigabytes(size: int) -> str:
+    return f"{size / 1e9:.1f} GB"
