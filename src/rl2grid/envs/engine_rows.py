@@ -145,11 +145,16 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
         # All or none: no row may have begun when another's options are refused.
         numbers = rows.tolist()
         positions = [self._next_position(i, seed, options) for i, seed in zip(numbers, seeds, strict=True)]
-        plans = [self._plan(position) for position in positions]
+        plans = self._begin_episodes(numbers, positions)
         for i, position, plan in zip(numbers, positions, plans, strict=True):
             self._take(i, position, plan)
-        self._start(numbers, plans)
         self._pending[rows] = self.state.terminated[rows] | self.state.truncated[rows]
+
+    def _begin_episodes(self, rows: list[int], positions: list[StreamPosition]) -> list[EpisodePlan]:
+        """Plan the episodes of ``positions``, begin them in ``rows`` and play to their first decisions."""
+        plans = [self._plan(position) for position in positions]
+        self._start(rows, plans)
+        return plans
 
     def _take(self, i: int, position: StreamPosition, plan: EpisodePlan) -> None:
         super()._take(i, position, plan)

@@ -13,9 +13,16 @@ from rl2grid.arrays import I64
 from rl2grid.engines.native.transitions import Commands, NativeTransitions, commands_of
 from rl2grid.envs.engine_rows import EngineRows
 from rl2grid.envs.options import TaskOptions
+from rl2grid.envs.task_environments import StreamPosition
 from rl2grid.envs.tasks import Task
+from rl2grid.grids import find_system
 from rl2grid.mdp.actions import DO_NOTHING
 from rl2grid.scenarios.episodes import EpisodePlan
+from rl2grid.scenarios.making import make_library_beside
+from rl2grid.scenarios.months import GeneratedScenarios
+from rl2grid.scenarios.splits import TRAIN
+
+_LARGEST_SEED = 2**63 - 1
 
 
 class NativeRows(EngineRows[Commands]):
@@ -41,6 +48,30 @@ class NativeRows(EngineRows[Commands]):
 
     def _effects(self, decisions: Commands) -> NDArray[np.object_]:
         return self.transitions.action_effects_of(decisions)
+
+    def _begin_episodes(self, rows: list[int], positions: list[StreamPosition]) -> list[EpisodePlan]:
+        if not self._plays_library(positions):
+            return super()._begin_episodes(rows, positions)
+        plans = self.transitions.begin_training(
+            np.array(rows),
+            np.array([position.seed for position in positions], np.int64),
+            np.array([position.number for position in positions], np.int64),
+            self.options.maintenance,
+            self._num_threads,
+        )
+        make_library_beside(self.grid)
+        return plans
+
+    def _plays_library(self, positions: list[StreamPosition]) -> bool:
+        """Whether episodes are drawn from the library of training years, and nobody chooses anything of them."""
+        scenarios, chosen = find_system(self.grid.id).scenarios, self.options.scenario is not None
+        return (
+            self.transitions.is_compiled
+            and self.options.split == TRAIN
+            and isinstance(scenarios, GeneratedScenarios)
+            and scenarios.generator_version(TRAIN) is not None
+            and not any(chosen or position.options or position.seed > _LARGEST_SEED for position in positions)
+        )
 
     def _start(self, rows: list[int], plans: list[EpisodePlan]) -> None:
         if not self.transitions.is_compiled:

@@ -44,12 +44,13 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from rl2grid.arrays import F32, F64, I32, Flags
+from rl2grid.arrays import F32, F64, I32, I64, Flags
 from rl2grid.compile import jit
 from rl2grid.errors import UsageError, one_of
 from rl2grid.grids import Grid, OpponentConfig
 from rl2grid.grids.axes import axis_sizes
 from rl2grid.mdp.state import GridState
+from rl2grid.philox import fill_uniforms
 from rl2grid.scenarios.episodes import MAX_STEPS
 from rl2grid.streams import Stream
 from rl2grid.structures import allocate, blank_row, constant, episode, row, scratch
@@ -60,6 +61,7 @@ KINDS = ("none", "weighted", "geometric", "multi_area")
 _NONE, _WEIGHTED, _GEOMETRIC, _MULTI_AREA = range(len(KINDS))
 _LEVELS = 1e5
 """Loadings are ranked in steps of 1 / _LEVELS."""
+_ATTACKS_AT_ONCE = 16
 _UNSET = -(2**31)
 """Next attack time before it is set (Grid2Op's ``None``)."""
 
@@ -80,6 +82,10 @@ class OpponentState(NamedTuple):
     cooldown: Annotated[I32, constant("1", "between attacks", "steps")]
     initial_budget: Annotated[F32, constant("1", "at the begin of an episode", "line-steps")]
     budget_per_step: Annotated[F32, constant("1", "earned", "line-steps")]
+    attack_period: Annotated[I32, constant("1", "in which an attack falls, weighted only", "steps")]
+    hazard_rate: Annotated[F64, constant("1", "chance that an attack begins, in a step")]
+    recovery_rate: Annotated[F64, constant("1", "chance that an attack ends, in a step")]
+    minimum_duration: Annotated[I32, constant("1", "shortest attack", "steps")]
 
     # Draws of the episode.
     n_attacks: Annotated[I32, episode("area", "attacks drawn", blank=0)]
@@ -158,6 +164,10 @@ def new_opponent_state(grid: Grid, n: int, longest_episode: int = MAX_STEPS) -> 
         cooldown=np.array([config.cooldown], np.int32),
         initial_budget=np.array([config.initial_budget], np.float32),
         budget_per_step=np.array([config.budget_per_step], np.float32),
+        attack_period=np.array([config.attack_period], np.int32),
+        hazard_rate=np.array([config.hazard_rate], np.float64),
+        recovery_rate=np.array([config.recovery_rate], np.float64),
+        minimum_duration=np.array([config.minimum_duration], np.int32),
     )
     for i in range(n):
         _begin_episode(opponent, i)
@@ -203,6 +213,72 @@ def load_draws(opponent: OpponentState, i: int, draws: OpponentDraws) -> None:
     opponent.n_attacks[i] = draws.n_attacks
     for name in ("waits", "durations", "choices"):
         getattr(opponent, name)[i, :, :most] = getattr(draws, name)[:, :most]
+
+
+@jit
+def draw_attacks(opponent: OpponentState, i: int, seed: int, key: int, n_steps: int) -> None:
+    """Begin an episode of ``n_steps`` steps in environment ``i`` with the draws of stream (seed, key).
+
+    What :func:`draw_opponent` draws and :func:`load_draws` loads, in compiled code.
+
+    Args:
+        opponent: The opponents, with room for the attacks of such an episode.
+        i: The environment.
+        seed: Of the stream.
+        key: Of the stream, see :func:`rl2grid.philox.fill_uniforms`.
+        n_steps: Steps of the episode.
+    """
+    blank_row(opponent, i)
+    opponent.budget[i] = opponent.initial_budget[0]
+    opponent.attack_cooldown[i] = opponent.cooldown[0]
+    kind, n_areas = opponent.kind[0], opponent.n_lines.size
+    if kind == _NONE:
+        return
+    shortest = opponent.max_duration[0] if kind == _WEIGHTED else opponent.minimum_duration[0] + 2
+    capacity = n_steps // max(shortest, 1) + 1
+    numbers = np.empty((_ATTACKS_AT_ONCE, n_areas, 3))
+    launched = np.zeros(n_areas, np.int64)
+    for attack in range(capacity):
+        place = attack % _ATTACKS_AT_ONCE
+        if place == 0:
+            fill_uniforms(seed, key, attack * n_areas * 3, numbers.reshape(-1))
+        going_on = False
+        for area in range(n_areas):
+            going_on |= _draw_attack(opponent, i, area, attack, numbers[place, area], launched, n_steps)
+        if not going_on:
+            return
+
+
+@jit
+def _draw_attack(
+    opponent: OpponentState, i: int, area: int, attack: int, numbers: F64, launched: I64, n_steps: int
+) -> bool:
+    """Draw the next attack of an area; whether there may be more.
+
+    ``launched`` counts the steps to the end of the last attack, per area, if none is ever refused.
+    """
+    if attack > opponent.n_attacks[i, area]:
+        return False
+    if opponent.kind[0] == _WEIGHTED:
+        opponent.waits[i, area, attack] = np.int32(numbers[0] * opponent.attack_period[0])
+        opponent.durations[i, area, attack] = opponent.max_duration[0]
+    else:
+        wait = _steps_until(numbers[0], opponent.hazard_rate[0])
+        duration = opponent.minimum_duration[0] + _steps_until(numbers[1], opponent.recovery_rate[0])
+        if launched[area] + wait >= n_steps:
+            return False
+        launched[area] += wait + duration
+        opponent.waits[i, area, attack] = wait
+        opponent.durations[i, area, attack] = duration
+    opponent.choices[i, area, attack] = numbers[2]
+    opponent.n_attacks[i, area] = attack + 1
+    return True
+
+
+@jit
+def _steps_until(uniform: float, chance: float) -> int:
+    """:func:`_geometric` of one number."""
+    return int(np.floor(np.log1p(-uniform) / np.log1p(-chance)) + 1)
 
 
 def imagine_opponent(

@@ -14,7 +14,7 @@ from rl2grid.engines.native.action_notes import note_action
 from rl2grid.engines.native.environments import Environments, open_environments
 from rl2grid.engines.native.orders import Orders, order_one_change
 from rl2grid.engines.native.simulation import begin_simulation, copy_environment, finish_simulation
-from rl2grid.engines.native.step import begin_step, dispatch_or_lose, finish_step, reset_row
+from rl2grid.engines.native.step import begin_step, dispatch_or_lose, finish_step
 from rl2grid.mdp.accumulate import accrue, begin_episode, begin_transition, end_reset
 from rl2grid.mdp.actions import ActionKind
 from rl2grid.mdp.heuristics import (
@@ -66,7 +66,7 @@ def advance(
         address: of the handle to the :class:`~rl2grid.engines.native.environments.Environments`.
         simulated: address of a handle to one environment, in which the careful heuristic tries things.
         rows: environments, int64 [k].
-        begins: show the first row of the episodes; nobody acts.
+        begins: the first rows of episodes are shown; nobody acts.
         first: where the changes of each agent's action begin, and where the last one's end, int64 [k + 1].
         kinds: what each change does, an :class:`~rl2grid.mdp.actions.ActionKind`, int64 [change].
         targets: lines or substations, int64 [change].
@@ -84,7 +84,6 @@ def advance(
         i = rows[k]
         illegal, ambiguous = False, False
         if begins:
-            reset_row(environments, i)
             begin_episode(state, i)
             remember_nothing(state, i)
             if heuristic >= CAREFUL:

@@ -6,7 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from rl2grid.arrays import I64
 from rl2grid.engines import DISPATCHES
+from rl2grid.engines.native.beginning import Draws, begin_episodes, draw_months
 from rl2grid.engines.native.entry import (
     begin_one,
     begin_simulation_one,
@@ -23,9 +25,10 @@ from rl2grid.engines.native.environments import Environments, new_environments
 from rl2grid.engines.native.hidden_state import new_hidden_state
 from rl2grid.engines.native.imagination import imagined_rows, outlook_of
 from rl2grid.engines.native.orders import write_order
-from rl2grid.engines.native.playing import Playing, playing_named, playing_scenario
+from rl2grid.engines.native.playing import Playing, playing_named, playing_series
+from rl2grid.engines.native.training_library import training_library
 from rl2grid.engines.native.worlds import RowLayout, restore_row, save_row
-from rl2grid.engines.worlds import Home, SeriesName, World, grid_fingerprint
+from rl2grid.engines.worlds import Home, Outlook, SeriesName, World, grid_fingerprint
 from rl2grid.errors import UsageError, one_of
 from rl2grid.grids import Grid
 from rl2grid.handles import Handle
@@ -34,9 +37,11 @@ from rl2grid.mdp.opponents import OpponentDraws, draw_opponent, load_draws
 from rl2grid.mdp.state import GridState
 from rl2grid.mdp.termination import GameOver
 from rl2grid.powerflow.model import Network, load_network
-from rl2grid.scenarios.episodes import EpisodePlan, planned_outages
-from rl2grid.scenarios.library import load_scenario
+from rl2grid.scenarios.episodes import MAX_STEPS, EpisodePlan, planned_outages
+from rl2grid.scenarios.library import open_series
 from rl2grid.scenarios.scenario import Scenario
+from rl2grid.scenarios.splits import YEARS_FOR_FIRST
+from rl2grid.scenarios.training_years import TrainingMonths
 from rl2grid.streams import Purpose, Stream
 from rl2grid.structures import with_own_workspace
 
@@ -86,18 +91,18 @@ class NativeEngine:
 
     def prepare(self, i: int, plan: EpisodePlan) -> None:
         """Hand environment ``i`` the episode ``plan``; its first row is not shown yet."""
-        scenario = load_scenario(self.grid.id, plan.scenario_id)
-        outages = planned_outages(self.grid, scenario, plan)
+        series = open_series(self.grid.id, plan.scenario_id)
+        outages = planned_outages(self.grid, series, plan)
         draws = None
         if self._attacks:
             stream = Stream(plan.seed, plan.number, Purpose.OPPONENT)
             draws = draw_opponent(self.grid, stream, plan.n_steps)
-        self.begin(i, scenario, plan.start, plan.n_steps, outages, draws)
+        self.begin(i, series, plan.start, plan.n_steps, outages, draws)
 
     def begin(
         self,
         i: int,
-        scenario: Scenario,
+        series: Scenario | TrainingMonths,
         start: int,
         n_steps: int,
         outages: np.ndarray[Any, np.dtype[np.int32]],
@@ -107,7 +112,7 @@ class NativeEngine:
 
         Args:
             i: the environment.
-            scenario: the series.
+            series: the series.
             start: row of the series that the reset shows.
             n_steps: steps of a completed episode.
             outages: planned outages, int32 [outage, 3]: line, first row, row after the last; by line and row.
@@ -121,7 +126,7 @@ class NativeEngine:
         hidden.outage_begin[i, : len(outages)] = outages[:, 1]
         hidden.outage_end[i, : len(outages)] = outages[:, 2]
         hidden.outage_count[i] = len(outages)
-        self._playing[i] = self._true[i] = playing = playing_scenario(scenario, start)
+        self._playing[i] = self._true[i] = playing = playing_series(series, start)
         playing.begin(hidden, i)
         if draws is not None:
             load_draws(self.environments.opponent, i, draws)
@@ -131,6 +136,37 @@ class NativeEngine:
         state.game_over[i] = int(GameOver.NONE)
         for flags in (state.terminated, state.truncated, state.illegal, state.ambiguous, state.attacked, state.excused):
             flags[i] = False
+
+    def draw_training(self, seeds: I64, numbers: I64) -> Draws:
+        """Which months of the library the training episodes ``numbers`` of ``seeds`` play; they are there then.
+
+        Raises:
+            UsageError: the data folder cannot be written, or has no room for the library.
+        """
+        draws = Draws(seeds, numbers, *(np.zeros_like(seeds) for _ in Draws._fields[2:]))
+        draw_months(np.array(YEARS_FOR_FIRST), draws)
+        library = training_library(self.grid)
+        library.open(draws.year)
+        self._make_room(library.most_outages)
+        return draws
+
+    def show_training(self, thread: int, rows: I64, draws: Draws, maintained: bool) -> None:
+        """Show the first rows of the episodes that were drawn, in ``rows``; threads may show different ones."""
+        library = training_library(self.grid).address
+        begin_episodes(self.address_for(thread), library, rows, draws, maintained, self._attacks)
+
+    def take_training(self, rows: I64, draws: Draws, maintained: bool) -> list[EpisodePlan]:
+        """Note what was begun in ``rows``; returns the plans of the episodes."""
+        library, hidden = training_library(self.grid), self.environments.hidden
+        plans = []
+        for i, seed, number, year, month, start, redraws in zip(
+            rows.tolist(), *map(np.ndarray.tolist, draws), strict=True
+        ):
+            months = library.months(year, month)
+            name = SeriesName(months.id, months.content_hash, start)
+            self._playing[i] = self._true[i] = Playing(name, months, hidden.series[i].copy(), hidden.forecast[i].copy())
+            plans.append(EpisodePlan(seed, number, months.id, start, MAX_STEPS, maintained, redraws))
+        return plans
 
     def step(self, i: int, action: StepAction) -> None:
         """Play one grid step of environment ``i``."""
@@ -218,9 +254,9 @@ class NativeEngine:
         rows = imagined_rows(self.grid, self._layout, self.environments.opponent, self.save(i).rows, seed)
         series = playing.name
         if isinstance(series, SeriesName):
-            scenario, gen_v = playing.source, self.environments.hidden.gen_v[i]
-            assert isinstance(scenario, Scenario)
-            series = outlook_of(scenario, series.start, int(state.step[i]), self._network, gen_v)
+            source, gen_v = playing.source, self.environments.hidden.gen_v[i]
+            assert not isinstance(source, Outlook)
+            series = outlook_of(source, series.start, int(state.step[i]), self._network, gen_v)
         return World(self.home, rows, series)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> NativeEngine:

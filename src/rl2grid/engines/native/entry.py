@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from rl2grid.arrays import I64
 from rl2grid.compile import jit
 from rl2grid.engines.native.environments import open_environments
 from rl2grid.engines.native.generation import set_generators
@@ -13,6 +14,14 @@ from rl2grid.engines.native.step import begin_step, dispatch_or_lose, finish_ste
 def reset_one(address: int, i: int) -> None:
     """Show the first row of environment ``i``, whose series and outages are set."""
     reset_row(open_environments(address), i)
+
+
+@jit
+def reset_rows(address: int, rows: I64) -> None:
+    """:func:`reset_one` for each of ``rows``, int64 [k]."""
+    environments = open_environments(address)
+    for i in rows:
+        reset_row(environments, i)
 
 
 @jit

@@ -57,7 +57,18 @@ class HiddenState(NamedTuple):
 
     # The episode.
     series: Annotated[I64, address("4", "of the first row played; 0: none (LOAD_P, LOAD_Q, PROD_P, PROD_V)")]
-    forecast: Annotated[I64, address("4", "of the forecasts made in that row; 0: the series is what is forecast")]
+    forecast: Annotated[
+        I64,
+        address(
+            "4",
+            "of the forecasts made in that row; 0: the series is what is forecast. Of training months the first is that"
+            " of the handle to the ForecastModel",
+        ),
+    ]
+    year: Annotated[I64, episode("", "seed of the training year whose integers are played; 0: no such year is")]
+    month: Annotated[I32, episode("", "first month played of that year, 0 .. 11")]
+    last_month: Annotated[I32, episode("", "last month played of that year")]
+    month_row: Annotated[I32, episode("", "row of its first month that the reset shows")]
     horizons: Annotated[I32, episode("", "that each row forecasts", "steps")]
     last_row: Annotated[I32, episode("", "whose row of the series all later steps repeat", "step")]
     outage_line: Annotated[I32, episode("outage", "planned outages, by line and begin")]

@@ -17,10 +17,12 @@ from rl2grid.grids import Grid
 from rl2grid.mdp.opponents import OpponentState, imagine_opponent
 from rl2grid.powerflow.model import Network
 from rl2grid.scenarios.scenario import Scenario
+from rl2grid.scenarios.training_years import TrainingMonths, forecasts_of
 from rl2grid.streams import Purpose, Stream
 
 F32 = NDArray[np.float32]
 Views = dict[str, NDArray[Any]]
+_WITH_VOLTAGES = ("load_p", "load_q", "prod_p", "prod_v")
 
 
 def imagined_rows(grid: Grid, layout: RowLayout, opponent: OpponentState, rows: Bytes, seed: int) -> Bytes:
@@ -43,29 +45,38 @@ def imagined_rows(grid: Grid, layout: RowLayout, opponent: OpponentState, rows: 
     return imagined
 
 
-def outlook_of(scenario: Scenario, start: int, step: int, network: Network, gen_v: NDArray[np.float64]) -> Outlook:
+def outlook_of(
+    series: Scenario | TrainingMonths, start: int, step: int, network: Network, gen_v: NDArray[np.float64]
+) -> Outlook:
     """The forecasts made at ``step``; without any, the present row.
 
     Args:
-        scenario: the series.
+        series: what is played.
         start: row of step 0.
         step: the present one.
         network: the electrical model.
         gen_v: present voltage set-points, per unit, float64 [gen]: they hold where none are forecast.
     """
-    row = start + step
-    if scenario.load_p_forecast is None:
-        series = [array[row : row + 1] for array in (scenario.load_p, scenario.load_q, scenario.prod_p)]
-    else:
-        forecasts = scenario.load_p_forecast, scenario.load_q_forecast, scenario.prod_p_forecast
-        series = [np.asarray(array)[row] for array in forecasts]
-    if scenario.prod_v_forecast is not None:
-        voltages: F32 = scenario.prod_v_forecast[row]
+    forecasts = _forecasts_of(series, start + step)
+    if len(forecasts) == len(_WITH_VOLTAGES):
+        rows, voltages = forecasts[:-1], forecasts[-1]
     else:
         measured = (gen_v * network.nominal_voltage[network.gen_sub]).astype(np.float32)
-        voltages = np.tile(measured, (len(series[0]), 1))
+        rows, voltages = forecasts, np.tile(measured, (len(forecasts[0]), 1))
     # Copies: views would keep the whole series open, and make a pickle of the world carry it.
-    return Outlook(scenario.id, step + 1, *(np.array(array, np.float32) for array in (*series, voltages)))
+    return Outlook(series.id, step + 1, *(np.array(array, np.float32) for array in (*rows, voltages)))
+
+
+def _forecasts_of(series: Scenario | TrainingMonths, row: int) -> tuple[F32, ...]:
+    """Demand, reactive demand, production, and voltages where they are forecast, float32 [step, element]."""
+    if isinstance(series, TrainingMonths):
+        voltage = forecasts_of(series.grid).voltage
+        made = series.forecasts(row)
+        return made if voltage is None else (*made, np.tile(voltage, (len(made[0]), 1)))
+    if series.load_p_forecast is None:
+        return tuple(array[row : row + 1] for array in (series.load_p, series.load_q, series.prod_p))
+    arrays = (getattr(series, f"{name}_forecast") for name in _WITH_VOLTAGES)
+    return tuple(array[row] for array in arrays if array is not None)
 
 
 def _announce_outages(views: Views, lines: NDArray[np.int64]) -> None:
@@ -98,6 +109,7 @@ def _imagine_opponent(grid: Grid, constants: OpponentState, views: Views, seed: 
 
 def _follow_outlook(views: Views) -> None:
     """Rows of the series after the present one are those of the outlook."""
+    views["hidden.year"][...] = 0
     horizons = max(int(views["hidden.horizons"]), 1)
     views["hidden.horizons"][...] = horizons
     views["hidden.last_row"][...] = int(views["state.step"]) + horizons

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import weakref
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,8 +11,9 @@ from numpy.typing import NDArray
 from rl2grid.engines.native.hidden_state import HiddenState
 from rl2grid.engines.worlds import Outlook, SeriesName, other_values
 from rl2grid.grids import Grid
-from rl2grid.scenarios.library import load_scenario
+from rl2grid.scenarios.library import open_series
 from rl2grid.scenarios.scenario import Scenario
+from rl2grid.scenarios.training_years import TrainingMonths, forecasts_of
 
 F32 = NDArray[np.float32]
 I64 = NDArray[np.int64]
@@ -24,7 +26,9 @@ _ENDLESS = 2**31 - 1
 class Playing:
     """A series from a row on; it keeps the arrays alive, of which compiled code knows the addresses only."""
 
-    def __init__(self, name: SeriesName | Outlook, source: Scenario | Outlook, series: I64, forecast: I64) -> None:
+    def __init__(
+        self, name: SeriesName | Outlook, source: Scenario | TrainingMonths | Outlook, series: I64, forecast: I64
+    ) -> None:
         self.name = name
         """What a world says of the series."""
         self.source = source
@@ -37,15 +41,36 @@ class Playing:
 
     def begin(self, hidden: HiddenState, i: int) -> None:
         """Let environment ``i`` play it from its first row, with the forecasts that were made."""
-        assert isinstance(self.source, Scenario)
+        assert not isinstance(self.source, Outlook)
         hidden.horizons[i] = horizons_of(self.source)
         hidden.last_row[i] = _ENDLESS
+        hidden.year[i] = 0
+        if isinstance(self.source, TrainingMonths):
+            assert isinstance(self.name, SeriesName)
+            hidden.year[i], hidden.month[i], _ = self.source.months
+            hidden.last_month[i] = self.source.months.numbers[-1]
+            hidden.month_row[i] = self.name.start
         self.go_on(hidden, i)
 
     def go_on(self, hidden: HiddenState, i: int) -> None:
         """Point environment ``i`` at the series."""
         hidden.series[i] = self.series
         hidden.forecast[i] = self.forecast
+
+
+def playing_series(series: Scenario | TrainingMonths, start: int) -> Playing:
+    """A series from row ``start`` on."""
+    return playing_months(series, start) if isinstance(series, TrainingMonths) else playing_scenario(series, start)
+
+
+def playing_months(months: TrainingMonths, start: int) -> Playing:
+    """Months of the library from row ``start`` on."""
+    forecasts, year = forecasts_of(months.grid), months.year
+    row = months.first_row_of_year + start
+    series = [_address_of(array, row) for array in (year.load_p, year.load_q, year.prod_p)]
+    series.append(0 if forecasts.voltage is None else int(forecasts.voltage.ctypes.data))
+    forecast = np.array([forecasts.model.address, 0, 0, 0], np.int64)
+    return Playing(SeriesName(months.id, months.content_hash, start), months, np.array(series, np.int64), forecast)
 
 
 def playing_scenario(scenario: Scenario, start: int) -> Playing:
@@ -70,14 +95,16 @@ def playing_named(grid: Grid, name: SeriesName | Outlook) -> Playing:
     """
     if isinstance(name, Outlook):
         return playing_outlook(name)
-    scenario = load_scenario(grid.id, name.scenario_id)
-    if scenario.content_hash != name.content_hash:
+    series = open_series(grid.id, name.scenario_id)
+    if series.content_hash != name.content_hash:
         raise other_values(grid.id, name)
-    return playing_scenario(scenario, name.start)
+    return playing_series(series, name.start)
 
 
-def horizons_of(scenario: Scenario) -> int:
+def horizons_of(scenario: Scenario | TrainingMonths) -> int:
     """Steps that each row forecasts."""
+    if isinstance(scenario, TrainingMonths):
+        return int(forecasts_of(scenario.grid).model.structure.horizon[0])
     return 0 if scenario.load_p_forecast is None else int(scenario.load_p_forecast.shape[1])
 
 
@@ -86,5 +113,9 @@ def _address(array: F32 | None, row: int) -> int:
     if array is None:
         return 0
     assert array.dtype == np.float32
+    return _address_of(array, row)
+
+
+def _address_of(array: NDArray[Any], row: int) -> int:
     assert array.flags.c_contiguous
     return int(array.ctypes.data) + row * array.strides[0]

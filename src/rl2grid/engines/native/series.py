@@ -1,32 +1,25 @@
 """Rows of the time series and planned outages, read by compiled code where they lie.
 
-Environments share the memory-mapped arrays of a scenario; each holds the address of its first row only.
+Environments share the memory-mapped arrays of a series; each holds the address of its first row only. A series is
+float32 numbers, forecasts included, or, in the months of the library that training plays, the integers of the generator
+(:mod:`rl2grid.scenarios.training_years`), whose forecasts are made when somebody asks for them and whose voltages are
+one row for all.
 """
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from llvmlite import ir
-from numba.core import types
-from numba.core.extending import intrinsic
 
-from rl2grid.arrays import F32
-from rl2grid.compile import jit
+from rl2grid.arrays import F32, I16
+from rl2grid.compile import jit, owning_jit
 from rl2grid.engines.native.environments import Environments
 from rl2grid.engines.native.hidden_state import LOAD_P, LOAD_Q, PROD_P, PROD_V, HiddenState
+from rl2grid.handles import opener
+from rl2grid.memory import float32_at, int16_at
+from rl2grid.scenarios.generator.calendar import MONTH_STEPS
+from rl2grid.scenarios.generator.forecast import ForecastModel, forecast_row
 
-
-@intrinsic  # type: ignore[untyped-decorator]
-def _float32_at(typing_context: Any, address: Any, index: Any) -> Any:
-    """The float32 number ``index`` places after ``address``."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        pointer = builder.inttoptr(arguments[0], ir.FloatType().as_pointer())
-        return builder.load(builder.gep(pointer, [arguments[1]]))
-
-    return types.float32(types.int64, types.int64), generate
+_open_forecast_model = opener(ForecastModel)
 
 
 @jit
@@ -44,13 +37,25 @@ def read_forecast(environments: Environments, i: int, source: HiddenState, row: 
     if source.forecast[row, LOAD_P] == 0:
         _read_series(environments, i, source, row, step + horizon)
         return
-    network, hidden = environments.network, environments.hidden
+    if source.year[row] > 0:
+        _make_forecast(environments, i, source, row, step, horizon)
+        _forecast_voltages(source.series[row, PROD_V], 0, environments, i, source, row)
+        return
+    hidden = environments.hidden
     place = np.int64(step) * source.horizons[row] + horizon - 1
     _copy(source.forecast[row, LOAD_P], place, hidden.load_p[i])
     _copy(source.forecast[row, LOAD_Q], place, hidden.load_q[i])
     _copy(source.forecast[row, PROD_P], place, hidden.new_p[i])
-    if source.forecast[row, PROD_V] != 0:
-        _read_voltages(source.forecast[row, PROD_V], place, environments, i)
+    _forecast_voltages(source.forecast[row, PROD_V], place, environments, i, source, row)
+
+
+@jit
+def _forecast_voltages(
+    address: int, place: int, environments: Environments, i: int, source: HiddenState, row: int
+) -> None:
+    network, hidden = environments.network, environments.hidden
+    if address != 0:
+        _read_voltages(address, place, environments, i)
         return
     for gen in range(hidden.gen_v.shape[1]):
         measured = np.float32(source.gen_v[row, gen] * network.nominal_voltage[network.gen_sub[gen]])
@@ -61,6 +66,12 @@ def read_forecast(environments: Environments, i: int, source: HiddenState, row: 
 def _read_series(environments: Environments, i: int, source: HiddenState, row: int, step: int) -> None:
     """Read into row ``i`` what the series of row ``row`` of ``source`` says of step ``step``."""
     hidden = environments.hidden
+    if source.year[row] > 0:
+        _copy_tenths(source.series[row, LOAD_P], step, hidden.load_p[i])
+        _copy_tenths(source.series[row, LOAD_Q], step, hidden.load_q[i])
+        _copy_tenths(source.series[row, PROD_P], step, hidden.new_p[i])
+        _read_voltages(source.series[row, PROD_V], 0, environments, i)
+        return
     place = min(step, source.last_row[row])
     _copy(source.series[row, LOAD_P], place, hidden.load_p[i])
     _copy(source.series[row, LOAD_Q], place, hidden.load_q[i])
@@ -87,8 +98,52 @@ def _copy(address: int, row: int, out: F32) -> None:
 
 
 @jit
+def _copy_tenths(address: int, row: int, out: F32) -> None:
+    for k in range(out.shape[0]):
+        out[k] = _integer(address, row * out.shape[0] + k) / 10.0
+
+
+@owning_jit
+def _make_forecast(environments: Environments, i: int, source: HiddenState, row: int, step: int, horizon: int) -> None:
+    """What training months forecast; voltages excepted."""
+    hidden = environments.hidden
+    active = _integers(source.series[row, LOAD_P], step + horizon, hidden.load_p.shape[1])
+    reactive = _integers(source.series[row, LOAD_Q], step + horizon, hidden.load_q.shape[1])
+    production = _integers(source.series[row, PROD_P], step + horizon, hidden.new_p.shape[1])
+    place = source.month_row[row] + step
+    later = min(place // MONTH_STEPS, source.last_month[row] - source.month[row])
+    forecast_row(
+        _open_forecast_model(source.forecast[row, LOAD_P]),
+        source.year[row],
+        source.month[row] + later,
+        place - later * MONTH_STEPS,
+        horizon,
+        active,
+        reactive,
+        production,
+        hidden.load_p[i],
+        hidden.load_q[i],
+        hidden.new_p[i],
+    )
+
+
+@owning_jit
+def _integers(address: int, row: int, size: int) -> I16:
+    values = np.empty(size, np.int16)
+    for k in range(size):
+        values[k] = _integer(address, row * size + k)
+    return values
+
+
+@jit
+def _integer(address: int, index: int) -> np.int16:
+    value: np.int16 = int16_at(np.int64(address), np.int64(index))  # type: ignore[call-arg]
+    return value
+
+
+@jit
 def _value(address: int, index: int) -> np.float32:
-    value: np.float32 = _float32_at(np.int64(address), np.int64(index))  # type: ignore[call-arg]
+    value: np.float32 = float32_at(np.int64(address), np.int64(index))  # type: ignore[call-arg]
     return value
 
 

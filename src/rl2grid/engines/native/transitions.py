@@ -27,7 +27,9 @@ from rl2grid.engines.native.advance import (
     advance,
     write_observations,
 )
+from rl2grid.engines.native.beginning import Draws
 from rl2grid.engines.native.engine import NativeEngine
+from rl2grid.engines.native.entry import reset_rows
 from rl2grid.engines.native.threads import Threads
 from rl2grid.engines.transition import Transitions
 from rl2grid.grids import Grid
@@ -217,7 +219,35 @@ class NativeTransitions(Transitions):
         if self.heuristic == "careful":
             for i in rows.tolist():
                 self.engine.check_horizon(i, 1)
+
+        def show(thread: int, part: slice) -> None:
+            reset_rows(self.engine.address_for(thread), rows[part])
+
+        self._in_threads(show, len(rows), num_threads)
         self._advance(rows, self._nothing[: len(rows)], num_threads, True)
+
+    def begin_training(
+        self, rows: I64, seeds: I64, numbers: I64, maintained: bool, num_threads: int
+    ) -> list[EpisodePlan]:
+        """Begin the training episodes ``numbers`` of ``seeds`` in ``rows`` and play to their first decisions.
+
+        What is begun is what :func:`~rl2grid.scenarios.episodes.plan_episode` plans of the library of training years.
+
+        Raises:
+            UsageError: the data folder cannot be written, or has no room for the library; nothing has begun then.
+        """
+        draws = self.engine.draw_training(seeds, numbers)
+
+        def show(thread: int, part: slice) -> None:
+            own = Draws(*(column[part] for column in draws))
+            self.engine.show_training(thread, rows[part], own, maintained)
+
+        self._in_threads(show, len(rows), num_threads)
+        self._advance(rows, self._nothing[: len(rows)], num_threads, True)
+        plans = self.engine.take_training(rows, draws, maintained)
+        for i in rows.tolist():
+            self.action_effects[i] = ""
+        return plans
 
     def write_observations(self, rows: I64, shift: F32, scale: F32, out: F32) -> None:
         """Write the observations of ``rows``, shifted and scaled, to the same rows of ``out``, float32 [n, feature]."""
@@ -233,19 +263,22 @@ class NativeTransitions(Transitions):
         return effects
 
     def _advance(self, rows: I64, commands: Commands, num_threads: int, begins: bool) -> None:
-        parts = max(1, min(num_threads, len(rows) // _ROWS_PER_THREAD))
-        if parts == 1:
-            self._advance_part(0, rows, commands, begins)
-            return
-        bounds = [len(rows) * part // parts for part in range(parts + 1)]
-        slices = [slice(first, last) for first, last in itertools.pairwise(bounds)]
-        for thread in range(parts):  # made here: threads must not make room at the same time
-            self._addresses(thread)
-
         def advance_slice(thread: int, part: slice) -> None:
             self._advance_part(thread, rows[part], commands[part], begins)
 
-        list(self._threads.map(advance_slice, range(parts), slices))
+        self._in_threads(advance_slice, len(rows), num_threads)
+
+    def _in_threads(self, play: Callable[[int, slice], None], n_rows: int, num_threads: int) -> None:
+        """Call ``play`` with the number of a thread and a part of ``n_rows`` rows, in as many threads as pay off."""
+        parts = max(1, min(num_threads, n_rows // _ROWS_PER_THREAD))
+        if parts == 1:
+            play(0, slice(0, n_rows))
+            return
+        bounds = [n_rows * part // parts for part in range(parts + 1)]
+        slices = [slice(first, last) for first, last in itertools.pairwise(bounds)]
+        for thread in range(parts):  # made here: threads must not make room at the same time
+            self._addresses(thread)
+        list(self._threads.map(play, range(parts), slices))
 
     def _addresses(self, thread: int) -> tuple[int, int]:
         """The environments, and where the careful heuristic may try things, for one thread."""
