@@ -62,7 +62,7 @@ def event(*, start: bool, module: str = "rl2grid.engines.native.advance") -> Any
 def test_a_long_compilation_says_how_far_it_is(monkeypatch: pytest.MonkeyPatch):
     said: list[str] = []
     clock = iter(range(0, 1000, 6))
-    monkeypatch.setattr(compile_notices, "_say", said.append)
+    monkeypatch.setattr(compile_notices, "say", said.append)
     monkeypatch.setattr(compile_notices.time, "monotonic", lambda: next(clock))
     notices = compile_notices.Notices()
     notices.notify(event(start=True))

@@ -221,5 +221,8 @@ def main() -> None:
             make_months(system.grid, year.seed, year.months)
         except UsageError as error:
             answer = str(error)
-        pickle.dump(answer, answers, pickle.HIGHEST_PROTOCOL)
-        answers.flush()
+        try:
+            pickle.dump(answer, answers, pickle.HIGHEST_PROTOCOL)
+            answers.flush()
+        except BrokenPipeError:  # who asked was killed
+            return

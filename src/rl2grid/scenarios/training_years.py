@@ -61,7 +61,6 @@ class ForecastInMemory(NamedTuple):
 class TrainingMonths:
     """Months of a year of the library, in a row; attributes are those of a :class:`Scenario` where it has them."""
 
-    id: str
     grid: Grid
     months: Months
     year: TrainingYear
@@ -69,6 +68,11 @@ class TrainingMonths:
     first_row: int = 0
     maintenance: None = None
     """Nothing is recorded of planned outages."""
+
+    @functools.cached_property
+    def id(self) -> str:
+        """For example ``generated/1000017-03+04``."""
+        return f"generated/{name_of(self.months)}"
 
     @property
     def n_steps(self) -> int:
@@ -95,7 +99,7 @@ class TrainingMonths:
         """They are a whole series."""
         return self.start_datetime
 
-    @property
+    @functools.cached_property
     def content_hash(self) -> str:
         """Names every value, through those of the year."""
         return f"{self.year.content_hash}-{self.months.first:02d}-{self.months.n_months}"
@@ -138,7 +142,7 @@ def training_months(grid: Grid, months: Months) -> TrainingMonths:
     Raises:
         UsageError: the data folder cannot be written, or has no room for the library.
     """
-    return TrainingMonths(f"generated/{name_of(months)}", grid, months, training_year(grid, months.seed))
+    return TrainingMonths(grid, months, training_year(grid, months.seed))
 
 
 def training_raw_month(grid: Grid, seed: int, month: int) -> RawMonth:

@@ -18,7 +18,7 @@ from rl2grid.scenarios.generator.constants import load_constants
 from rl2grid.scenarios.month_names import MONTHS, Months
 from rl2grid.scenarios.outage_draws import most_outages, outage_model
 from rl2grid.scenarios.splits import FIRST_TRAINING_SEED, TRAINING_YEARS
-from rl2grid.scenarios.training_years import TrainingMonths, forecasts_of, training_months, training_year
+from rl2grid.scenarios.training_years import TrainingMonths, TrainingYear, forecasts_of, training_year
 
 
 class TrainingLibrary:
@@ -52,6 +52,7 @@ class TrainingLibrary:
         """Of the handle to the :class:`~rl2grid.engines.native.beginning.Library`."""
         self.most_outages = most_outages(outages)
         """No episode has more."""
+        self._years: dict[int, TrainingYear] = {}
         self._months: dict[tuple[int, int], TrainingMonths] = {}
 
     def open(self, years: I64) -> None:
@@ -64,14 +65,15 @@ class TrainingLibrary:
         with self._lock:
             for number in np.unique(years[addresses[years, 0] == 0]).tolist():
                 year = training_year(self._grid, FIRST_TRAINING_SEED + number)
+                self._years[number] = year
                 addresses[number] = [array.ctypes.data for array in (year.load_p, year.load_q, year.prod_p)]
 
     def months(self, year: int, month: int) -> TrainingMonths:
         """Two months in a row of an open year."""
         found = self._months.get((year, month))
         if found is None:
-            found = training_months(self._grid, Months(FIRST_TRAINING_SEED + year, month, 2))
-            self._months[year, month] = found
+            months = Months(FIRST_TRAINING_SEED + year, month, 2)
+            found = self._months[year, month] = TrainingMonths(self._grid, months, self._years[year])
         return found
 
 
