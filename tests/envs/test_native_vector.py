@@ -11,6 +11,7 @@ import numba
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
+from returned import assert_same, copied, put_together, with_ending
 
 import rl2grid  # noqa: F401 - registers the tasks
 from rl2grid.envs.vector import PowerGridVectorEnv
@@ -45,43 +46,6 @@ def actions_of(vector: PowerGridVectorEnv, seeds: list[int], decision: int) -> A
     return np.array([action_of(vector.task, seed, decision) for seed in seeds])
 
 
-def copied(returned: Any) -> Any:
-    """What a call returned, kept from the buffers that later calls write to; effects in words."""
-    if isinstance(returned, dict):
-        return {key: copied(value) for key, value in returned.items()}
-    if isinstance(returned, tuple | list):
-        return tuple(copied(item) for item in returned)
-    if isinstance(returned, np.ndarray) and returned.dtype == object:
-        return np.array([copied(item) for item in returned] + [None], object)[:-1]
-    if isinstance(returned, np.ndarray):
-        return returned.copy()
-    if returned is None or isinstance(returned, int | float | str | np.generic):
-        return returned
-    return str(returned)
-
-
-def assert_same(mine: Any, theirs: Any, where: str = "") -> None:
-    """The same keys, types, shapes and values, bit for bit."""
-    if isinstance(theirs, dict):
-        assert set(mine) == set(theirs), where
-        for key in theirs:
-            assert_same(mine[key], theirs[key], f"{where}/{key}")
-    elif isinstance(theirs, tuple):
-        assert len(mine) == len(theirs), where
-        for k, pair in enumerate(zip(mine, theirs, strict=True)):
-            assert_same(*pair, f"{where}/{k}")
-    elif isinstance(theirs, np.ndarray):
-        assert mine.dtype == theirs.dtype, where
-        assert mine.shape == theirs.shape, where
-        if theirs.dtype == object:
-            for k, pair in enumerate(zip(mine, theirs, strict=True)):
-                assert_same(*pair, f"{where}/{k}")
-        else:
-            np.testing.assert_array_equal(mine, theirs, err_msg=where)
-    else:
-        assert mine == theirs, where
-
-
 def play(vector: PowerGridVectorEnv, seeds: list[int], decisions: int) -> list[Any]:
     """Copies of everything that a vector returns, from the reset on."""
     returned = [copied(vector.reset(seed=seeds))]
@@ -93,14 +57,14 @@ def play(vector: PowerGridVectorEnv, seeds: list[int], decisions: int) -> list[A
 class Singles:
     """Single environments put together as Gymnasium's vector environments do."""
 
-    def __init__(self, vector: PowerGridVectorEnv, task: str, seeds: list[int], **keywords: Any) -> None:
-        self._vector, self._seeds = vector, seeds
+    def __init__(self, task: str, seeds: list[int], **keywords: Any) -> None:
+        self._seeds = seeds
         self._envs = [make_single(task, **keywords) for _ in seeds]
 
     def play(self, decisions: int) -> list[Any]:
         """What :func:`play` returns."""
         begun = [env.reset(seed=seed) for env, seed in zip(self._envs, self._seeds, strict=True)]
-        returned: list[Any] = [(np.stack([one[0] for one in begun]), self._infos([one[1] for one in begun]))]
+        returned: list[Any] = [(np.stack([one[0] for one in begun]), put_together([one[1] for one in begun]))]
         return returned + [self._step(decision) for decision in range(decisions)]
 
     def _step(self, decision: int) -> Any:
@@ -108,21 +72,14 @@ class Singles:
         for env, seed in zip(self._envs, self._seeds, strict=True):
             observation, reward, over, complete, info = env.step(action_of(env.task, seed, decision))
             if over or complete:
-                ending = {"final_obs": observation, "final_info": info}
-                observation, begun = env.reset()
-                info = begun | ending
+                last, (observation, begun) = observation, env.reset()
+                info = with_ending(begun, last, info)
             observations.append(observation)
             rewards.append(reward)
             terminated.append(over)
             truncated.append(complete)
             infos.append(info)
-        return np.stack(observations), np.array(rewards), np.array(terminated), np.array(truncated), self._infos(infos)
-
-    def _infos(self, infos: list[dict[str, Any]]) -> dict[str, Any]:
-        together: dict[str, Any] = {}
-        for i, info in enumerate(infos):
-            self._vector._add_info(together, info, i)
-        return copied(together)
+        return np.stack(observations), np.array(rewards), np.array(terminated), np.array(truncated), put_together(infos)
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -132,11 +89,22 @@ def test_equals_single_environments_put_together_by_gymnasium(task, heuristic):
     keywords = {"heuristic": heuristic, "gamma": 0.99}
     vector = make_vector(task, len(seeds), **keywords)
     mine = play(vector, seeds, 40)
-    theirs = Singles(vector, task, seeds, **keywords).play(40)
+    theirs = Singles(task, seeds, **keywords).play(40)
     for decision, pair in enumerate(zip(mine, theirs, strict=True)):
         assert_same(*pair, f"{decision - 1}")
     if heuristic is not None or not task.endswith("-R"):  # which are not lost that soon
         assert any((one[2] | one[3]).any() for one in mine[1:]), "no episode ended: the test did not see an autoreset"
+
+
+def test_several_endings_in_a_step_and_none_are_put_together_as_gymnasium_does():
+    seeds = list(range(12))
+    mine = play(make_vector("bus14-T0", len(seeds)), seeds, 12)
+    theirs = Singles("bus14-T0", seeds).play(12)
+    for decision, pair in enumerate(zip(mine, theirs, strict=True)):
+        assert_same(*pair, f"{decision - 1}")
+    ends = {int((one[2] | one[3]).sum()) for one in mine[1:]}
+    assert 0 in ends, "every step ended an episode"
+    assert max(ends) > 1, "no step ended several"
 
 
 def assert_close(mine: Any, theirs: Any, where: str = "") -> None:
@@ -353,11 +321,10 @@ def test_a_reward_of_the_user_changes_rewards_only(task):
 def test_listeners_change_nothing(task):
     heard: list[int] = []
     keywords = {"heuristic": "recovery", "gamma": 0.9}
-    vector = make_vector(task, 1, **keywords)
-    listening = Singles(vector, task, [5], **keywords)
+    listening = Singles(task, [5], **keywords)
     listening._envs[0].step_listeners.append(lambda state, i: heard.append(int(state.step[i])))
     mine = listening.play(25)
-    theirs = Singles(vector, task, [5], **keywords).play(25)
+    theirs = Singles(task, [5], **keywords).play(25)
     for one, other in zip(mine, theirs, strict=True):
         assert_same(one, other)
     played = mine[-1][-1]["grid_steps"][0] + sum(int((one[2] | one[3])[0]) for one in mine[1:])

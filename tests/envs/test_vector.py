@@ -4,6 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
+from returned import assert_same, copied, put_together, with_ending
 
 import rl2grid  # noqa: F401 - registers the tasks
 from rl2grid.envs.vector import PowerGridVectorEnv
@@ -59,6 +60,7 @@ def test_workers_play_refuse_and_come_back_as_one_process_does():
     for x, y in zip(a[:3], b[:3], strict=True):
         np.testing.assert_array_equal(x, y)
     assert a[2].any(), "no episode ended: the test did not see an autoreset"
+    assert_same(copied(b[3]), copied(a[3]))
 
     with pytest.raises(UsageError, match="is not in the split train of bus14: choose one such as"):
         workers.reset(options={"scenario": "no such month"})
@@ -92,31 +94,30 @@ def assert_same_steps(straight, resumed, saved):
         np.testing.assert_array_equal(a[4]["grid_steps"], b[4]["grid_steps"])
 
 
-def test_equals_single_environments_and_shows_the_ending():
+def test_equals_single_environments_put_together_by_gymnasium():
     vector = make_vector(2, 0)
     singles = [gymnasium.make("rl2grid/bus14-T0-v0", **KEYWORDS) for _ in range(2)]
-    observations, _ = vector.reset(seed=5)
-    for i, single in enumerate(singles):
-        np.testing.assert_array_equal(single.reset(seed=5 + i)[0], observations[i])
-    endings = 0
+    observations, infos = vector.reset(seed=5)
+    begun = [single.reset(seed=5 + i) for i, single in enumerate(singles)]
+    np.testing.assert_array_equal(observations, [one[0] for one in begun])
+    assert_same(copied(infos), put_together([one[1] for one in begun]))
+    ends = []
     for step in range(STEPS):
         actions = actions_of(step, 2)
-        observations, rewards, terminated, truncated, infos = vector.step(actions)
-        for i, single in enumerate(singles):
-            observation, reward, over, complete, info = single.step(int(actions[i]))
-            assert (rewards[i], terminated[i], truncated[i]) == (reward, over, complete)
-            if over or complete:
-                endings += 1
-                np.testing.assert_array_equal(infos["final_obs"][i], observation)
-                assert infos["_final_info"][i]
-                assert infos["final_info"]["survival"][i] == info["survival"]
-                assert infos["final_info"]["costs"]["TLO"][i] == info["costs"]["TLO"]
-                observation, info = single.reset()
-            np.testing.assert_array_equal(observations[i], observation)
-            assert infos["n_steps"][i] == info["n_steps"]
-            assert infos["discounted_reward"][i] == info["discounted_reward"]
-            assert infos["grid_steps"][i] == info["grid_steps"]
-    assert endings > 0
+        played = []
+        for action, single in zip(actions, singles, strict=True):
+            observation, reward, terminated, truncated, info = single.step(int(action))
+            if terminated or truncated:
+                last, (observation, begun) = observation, single.reset()
+                info = with_ending(begun, last, info)
+            played.append((observation, reward, terminated, truncated, info))
+        *theirs, their_infos = zip(*played, strict=True)
+        *mine, infos = vector.step(actions)
+        for array, values in zip(mine, theirs, strict=True):
+            np.testing.assert_array_equal(array, values)
+        assert_same(copied(infos), put_together(their_infos), f"{step}")
+        ends.append(int(np.sum(mine[2] | mine[3])))
+    assert {0, 1, 2} <= set(ends), "the test did not see one autoreset, both and none"
     for environment in (vector, *singles):
         environment.close()
 

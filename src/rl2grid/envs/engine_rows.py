@@ -8,10 +8,10 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from rl2grid.arrays import I64
+from rl2grid.arrays import I64, Flags
 from rl2grid.engines.worlds import World, world_of_plain
 from rl2grid.envs.description import check_action
-from rl2grid.envs.info import batch_info
+from rl2grid.envs.info_arrays import InfoArrays, Underway, info_arrays
 from rl2grid.envs.options import TaskOptions
 from rl2grid.envs.row_view import RowView, public_names
 from rl2grid.envs.rows import Batch
@@ -41,6 +41,7 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
         self._redraws = np.zeros(n, np.int64)
         self._earlier_steps = np.zeros(n, np.int64)  # grid steps of earlier episodes of a seed's stream
         self._shown_effects = np.full(n, "", object)
+        self._all_begun = False  # every row was reset or restored once
 
     def reset(self, seeds: list[int | None], options: dict[str, Any] | None) -> Batch:
         """See :meth:`rl2grid.envs.rows.Rows.reset`."""
@@ -50,10 +51,9 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
     def step(self, actions: Any) -> Batch:
         """See :meth:`rl2grid.envs.rows.Rows.step`."""
         decisions = self._decided(actions)
-        rows, waiting = self._rows, self._pending.copy()
-        if waiting.any():  # these rows return the ending that their reset has already played
-            rows = np.flatnonzero(~waiting)
-            self._pending[:] = False
+        waiting = np.flatnonzero(self._pending)  # these rows return the ending that their reset has already played
+        rows = np.flatnonzero(~self._pending) if len(waiting) else self._rows
+        self._pending[waiting] = False
         self._note_decisions()
         self._play(rows, decisions)
         self._note_reached()
@@ -61,11 +61,12 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
         effects[waiting] = ""
         state = self.state
         rewards, terminated, truncated = state.transition_reward.copy(), state.terminated.copy(), state.truncated.copy()
-        ended = np.flatnonzero(terminated | truncated)
-        endings = {i: self._ending(i, str(effects[i])) for i in ended.tolist()}
-        if len(ended):
-            self._begin(ended, [None] * len(ended), None)
-            effects[ended] = ""
+        ended, endings = terminated | truncated, {}
+        if ended.any():
+            endings = self._endings(ended, effects)
+            begun = np.flatnonzero(ended)
+            self._begin(begun, [None] * len(begun), None)
+            effects[begun] = ""
         batch = self._batch(effects)
         batch.rewards, batch.terminated, batch.truncated, batch.endings = rewards, terminated, truncated, endings
         return batch
@@ -100,8 +101,6 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
     def restore(self, i: int, world: World) -> None:
         """Bring row ``i`` to where ``world`` was saved; see :meth:`TaskEnvironments.restore`."""
         super().restore(i, world)
-        # A copy: the array was handed out with the infos of the last step.
-        self._shown_effects = self._shown_effects.copy()
         self._shown_effects[i] = self.transitions.action_effects[i]
 
     def ask(self, name: str, arguments: tuple[Any, ...], keywords: dict[str, Any]) -> list[Any]:
@@ -141,6 +140,10 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
     def _observations(self) -> NDArray[np.float32]:
         """The observations of all rows, float32 [n, feature]."""
 
+    @abstractmethod
+    def _last_observations(self, rows: I64) -> NDArray[np.float32]:
+        """The observations of ``rows``, which stay what they are, float32 [row, feature]."""
+
     def _begin(self, rows: I64, seeds: list[int | None], options: dict[str, Any] | None) -> None:
         # All or none: no row may have begun when another's options are refused.
         numbers = rows.tolist()
@@ -163,8 +166,10 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
 
     def _decided(self, actions: Any) -> Decisions:
         """The actions of all rows, checked."""
-        for i in range(self._n):
-            self._position(i)
+        if not self._all_begun:
+            for i in range(self._n):
+                self._position(i)
+            self._all_begun = True
         given = len(actions) if hasattr(actions, "__len__") else 1
         if given != self._n:
             raise UsageError(f"{given} actions were given for {self._n} environments: give one each.")
@@ -175,26 +180,19 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
         for action in actions:
             check_action(self.task, action)
 
-    def _ending(self, i: int, effect: str) -> dict[str, Any]:
-        observation = np.zeros(self._size, np.float32)
-        self.write_observation(i, observation)
-        self.transitions.action_effects[i] = effect
-        return {"final_obs": observation, "final_info": self.info(i)}
+    def _endings(self, ended: Flags, effects: NDArray[np.object_]) -> dict[str, Any]:
+        """:attr:`Batch.endings` of the episodes that have ``ended``, bool [n]."""
+        rows = np.flatnonzero(ended)
+        observations = np.full(self._n, None, object)
+        for i, observation in zip(rows.tolist(), self._last_observations(rows), strict=True):
+            observations[i] = observation
+        return {"final_obs": observations, "final_info": self._infos(effects).only(ended).named()}
+
+    def _infos(self, effects: NDArray[np.object_]) -> InfoArrays:
+        underway = Underway(self._scenarios, self._starts, self._redraws, self._earlier_steps, self._pending, effects)
+        return info_arrays(self.state, underway, self.constraint, self.options.gamma is not None, self._hash)
 
     def _batch(self, effects: NDArray[np.object_]) -> Batch:
         self._shown_effects = effects
-        infos = {
-            "scenario": self._scenarios.copy(),
-            "start": self._starts.copy(),
-            "start_redraws": self._redraws.copy(),
-            **batch_info(self.state, self.constraint),
-            "action_effect": effects,
-        }
-        infos["grid_steps"] = self._earlier_steps + infos["step"]
-        infos["over"] = self._pending.copy()
-        if self.options.gamma is not None:
-            infos["discounted_reward"] = self.state.transition_discounted.copy()
-        if self._hash is not None:
-            infos["action_set_hash"] = np.full(self._n, self._hash, object)
         off = np.zeros(self._n, np.bool_)
-        return Batch(self._observations(), np.zeros(self._n), off, off.copy(), infos)
+        return Batch(self._observations(), np.zeros(self._n), off, off.copy(), self._infos(effects).named())

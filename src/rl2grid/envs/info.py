@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rl2grid.mdp.constraint_table import CONSTRAINTS
 from rl2grid.mdp.scores import SCORES
@@ -15,6 +14,8 @@ from rl2grid.mdp.termination import GAME_OVER_TEXT, GameOver
 
 COMPONENTS: tuple[str, ...] = ("survive", "overload", "cost")
 """Names of the reward components."""
+COSTS: tuple[str, ...] = tuple(CONSTRAINTS)
+"""Names of the costs."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class InfoKey:
     meaning: str
 
 
-_ALWAYS, _COSTS = "always", tuple(CONSTRAINTS)
+_ALWAYS = "always"
 INFO_KEYS: tuple[InfoKey, ...] = (
     InfoKey("scenario", "str", "", _ALWAYS, "id of the scenario being played"),
     InfoKey("start", "int", "row", _ALWAYS, "row of the scenario at which the episode began"),
@@ -45,16 +46,16 @@ INFO_KEYS: tuple[InfoKey, ...] = (
         "float",
         "",
         _ALWAYS,
-        f"cost of the task's constraint (without one: {' + '.join(_COSTS)}), transition sum",
+        f"cost of the task's constraint (without one: {' + '.join(COSTS)}), transition sum",
     ),
-    InfoKey("costs", "dict", "", _ALWAYS, f"{', '.join(_COSTS)}: sums over the transition"),
+    InfoKey("costs", "dict", "", _ALWAYS, f"{', '.join(COSTS)}: sums over the transition"),
     InfoKey("reset_steps", "int", "grid steps", _ALWAYS, "grid steps that `reset` played before the first decision"),
     InfoKey("reset_reward", "float", "", _ALWAYS, "their rewards, which are in no transition"),
     InfoKey("reset_components", "dict", "", _ALWAYS, "survive, overload, cost: their sums"),
-    InfoKey("reset_costs", "dict", "", _ALWAYS, f"{', '.join(_COSTS)}: their sums"),
+    InfoKey("reset_costs", "dict", "", _ALWAYS, f"{', '.join(COSTS)}: their sums"),
     InfoKey("episode_return", "float", "", _ALWAYS, "rewards of the episode so far"),
     InfoKey("episode_components", "dict", "", _ALWAYS, "survive, overload, cost: sums over the episode so far"),
-    InfoKey("episode_costs", "dict", "", _ALWAYS, f"{', '.join(_COSTS)}: sums over the episode so far"),
+    InfoKey("episode_costs", "dict", "", _ALWAYS, f"{', '.join(COSTS)}: sums over the episode so far"),
     InfoKey("scores", "dict", "", _ALWAYS, "margin, overload, topology (paper, Section 5): means per grid step"),
     InfoKey("illegal", "bool", "", _ALWAYS, "the agent's action broke a rule and became do nothing"),
     InfoKey("ambiguous", "bool", "", _ALWAYS, "the agent's action had no single meaning and became do nothing"),
@@ -68,14 +69,15 @@ INFO_KEYS: tuple[InfoKey, ...] = (
 )
 
 
-_GAME_OVER_WORDS = np.array(
+GAME_OVER_WORDS = np.array(
     [f"{reason.name}: {GAME_OVER_TEXT[reason]}" if reason else "" for reason in GameOver], dtype=object
 )
+"""object [GameOver], the game over in words; empty while the grid is alive."""
 
 
 def episode_info(state: GridState, i: int, constraint: str | None) -> dict[str, Any]:
     """What the state alone tells about environment ``i``; see :data:`INFO_KEYS`."""
-    costs = _named(_COSTS, state.transition_costs[i])
+    costs = _named(COSTS, state.transition_costs[i])
     step, length = int(state.step[i]), int(state.episode_length[i])
     reason = GameOver(int(state.game_over[i]))
     scored = max(step - int(state.terminated[i]), 1)  # the step of a game over has no flow to score
@@ -91,47 +93,16 @@ def episode_info(state: GridState, i: int, constraint: str | None) -> dict[str, 
         "reset_steps": int(state.reset_steps[i]),
         "reset_reward": float(state.reset_reward[i]),
         "reset_components": _named(COMPONENTS, state.reset_components[i]),
-        "reset_costs": _named(_COSTS, state.reset_costs[i]),
+        "reset_costs": _named(COSTS, state.reset_costs[i]),
         "episode_return": float(state.episode_return[i]),
         "episode_components": _named(COMPONENTS, state.episode_components[i]),
-        "episode_costs": _named(_COSTS, state.episode_costs[i]),
+        "episode_costs": _named(COSTS, state.episode_costs[i]),
         "scores": {name: value / scored for name, value in _named(SCORES, state.episode_scores[i]).items()},
         "illegal": bool(state.illegal[i]),
         "ambiguous": bool(state.ambiguous[i]),
         "attacked_lines": state.attacked[i].copy(),
         "game_over": int(reason),
-        "game_over_text": _GAME_OVER_WORDS[reason],
-    }
-
-
-def batch_info(state: GridState, constraint: str | None) -> dict[str, Any]:
-    """:func:`episode_info` of all environments at once: arrays [n], dicts of arrays, and object [n] for words."""
-    costs = _named_columns(_COSTS, state.transition_costs)
-    step = state.step.astype(np.int64)
-    survived = np.maximum(step - state.terminated, 0)
-    scored = np.maximum(step - state.terminated, 1)[:, np.newaxis]
-    return {
-        "step": step,
-        "episode_length": state.episode_length.astype(np.int64),
-        "survival": survived / state.episode_length,
-        "decisions": state.decisions.astype(np.int64),
-        "n_steps": state.n_steps.astype(np.int64),
-        "reward_components": _named_columns(COMPONENTS, state.transition_components),
-        "cost": costs[constraint] if constraint else state.transition_costs.sum(axis=1),
-        "costs": costs,
-        "reset_steps": state.reset_steps.astype(np.int64),
-        "reset_reward": state.reset_reward.copy(),
-        "reset_components": _named_columns(COMPONENTS, state.reset_components),
-        "reset_costs": _named_columns(_COSTS, state.reset_costs),
-        "episode_return": state.episode_return.copy(),
-        "episode_components": _named_columns(COMPONENTS, state.episode_components),
-        "episode_costs": _named_columns(_COSTS, state.episode_costs),
-        "scores": _named_columns(SCORES, state.episode_scores / scored),
-        "illegal": state.illegal.copy(),
-        "ambiguous": state.ambiguous.copy(),
-        "attacked_lines": state.attacked.copy(),
-        "game_over": state.game_over.astype(np.int64),
-        "game_over_text": _GAME_OVER_WORDS[state.game_over],
+        "game_over_text": GAME_OVER_WORDS[reason],
     }
 
 
@@ -143,7 +114,3 @@ def survival(state: GridState, i: int) -> float:
 
 def _named(names: tuple[str, ...], values: Any) -> dict[str, float]:
     return {name: float(value) for name, value in zip(names, values, strict=True)}
-
-
-def _named_columns(names: tuple[str, ...], values: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
-    return {name: values[:, column].copy() for column, name in enumerate(names)}

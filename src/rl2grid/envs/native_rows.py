@@ -35,7 +35,11 @@ class NativeRows(EngineRows[Commands]):
         self._num_threads = num_threads or os.cpu_count() or 1
         self._one_change_each = np.arange(n + 1)
         self._injections = replace(commands_of(task.grid, [DO_NOTHING] * n), injects=np.ones(n, np.bool_))
+        self._no_injection = (np.zeros(n, np.bool_), np.zeros((n, 0), np.float32))
+        if self._catalogue is not None:  # numbers as the engine takes them
+            self._kinds, self._targets = self._catalogue.kind.astype(np.int64), self._catalogue.target.astype(np.int64)
         self._buffers = [np.zeros((n, self._size), np.float32) for _ in range(2)]
+        self._last = np.zeros((n, self._size), np.float32)
 
     def _arguments(self) -> tuple[Any, ...]:
         return *super()._arguments(), self._num_threads
@@ -88,20 +92,22 @@ class NativeRows(EngineRows[Commands]):
         self.transitions.write_observations(self._rows, *self._normaliser, self._buffers[0])
         return self._buffers[0]
 
+    def _last_observations(self, rows: I64) -> NDArray[np.float32]:
+        self.transitions.write_observations(rows, *self._normaliser, self._last)
+        return self._last[rows]
+
     def _discrete(self, actions: Any) -> Commands:
         assert self._catalogue is not None
         numbers = np.asarray(actions)
         valid = numbers.shape == (self._n,) and np.issubdtype(numbers.dtype, np.integer)
         if not valid or numbers.min() < 0 or numbers.max() >= len(self._catalogue):
             self._check(actions)
-        kinds, targets, masks = self._catalogue.kind, self._catalogue.target, self._catalogue.mask
         return Commands(
             self._one_change_each,
-            kinds[numbers].astype(np.int64),
-            targets[numbers].astype(np.int64),
-            masks[numbers],
-            np.zeros(self._n, np.bool_),
-            np.zeros((self._n, 0), np.float32),
+            self._kinds[numbers],
+            self._targets[numbers],
+            self._catalogue.mask[numbers],
+            *self._no_injection,
         )
 
     def _continuous(self, actions: Any) -> Commands:

@@ -107,18 +107,15 @@ class RemoteRows:
 
     def _together(self, batches: list[Batch]) -> Batch:
         """The batches of all workers as that of all rows."""
-        endings = {
-            part.start + i: ending
-            for part, batch in zip(self._parts, batches, strict=True)
-            for i, ending in batch.endings.items()
-        }
+        shown = next((batch.endings for batch in batches if batch.endings), {})
+        endings = [batch.endings or _blank(shown, len(batch.rewards)) for batch in batches]
         return Batch(
             np.concatenate([batch.observations for batch in batches]),
             np.concatenate([batch.rewards for batch in batches]),
             np.concatenate([batch.terminated for batch in batches]),
             np.concatenate([batch.truncated for batch in batches]),
             _joined([batch.infos for batch in batches]),
-            endings,
+            _joined(endings),
         )
 
 
@@ -137,4 +134,14 @@ def _joined(infos: list[dict[str, Any]]) -> dict[str, Any]:
         if isinstance(value, dict)
         else np.concatenate([info[key] for info in infos])
         for key, value in infos[0].items()
+    }
+
+
+def _blank(infos: dict[str, Any], n: int) -> dict[str, Any]:
+    """Infos of ``n`` rows that have none, of the form of ``infos``."""
+    return {
+        key: _blank(value, n)
+        if isinstance(value, dict)
+        else np.full((n, *value.shape[1:]), None if value.dtype == object else 0, value.dtype)
+        for key, value in infos.items()
     }

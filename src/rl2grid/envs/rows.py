@@ -32,8 +32,9 @@ class Batch:
     """bool [n]; False after a reset."""
     infos: dict[str, Any]
     """By key of :data:`~rl2grid.envs.info.INFO_KEYS`: arrays [n] or dicts of such. Every row has every key."""
-    endings: dict[int, dict[str, Any]] = field(default_factory=dict)
-    """By row: ``final_obs`` and ``final_info`` of the episodes that ended in this step."""
+    endings: dict[str, Any] = field(default_factory=dict)
+    """``final_obs``, object [n], and ``final_info``, as ``infos``, of the episodes that ended in this step; None, zero
+    and False in rows where none did. Empty where no row has one."""
 
 
 class Rows(Protocol):

@@ -32,7 +32,8 @@ class PowerGridVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], Any, ND
     environments, threads or workers.
 
     On the native engine, observations are written into two buffers that take turns: those of a step are
-    valid until the step after the next. ``infos["action_effect"]`` holds objects that are put into words by ``str``.
+    valid until the step after the next. ``action_effect``, in ``infos`` and in ``infos["final_info"]``, holds objects
+    that are put into words by ``str``.
 
     Args:
         task: the task, or its id.
@@ -196,15 +197,15 @@ class PowerGridVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], Any, ND
     def _present(self, batch: Batch) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """Observations and infos as Gymnasium wants them."""
         infos = _with_masks(batch.infos, np.ones(self.num_envs, np.bool_))
-        for i, ending in batch.endings.items():
-            self._add_info(infos, ending, i)
+        if batch.endings:
+            infos |= _with_masks(batch.endings, batch.terminated | batch.truncated)
         return batch.observations, infos
 
 
-def _with_masks(info: dict[str, Any], everywhere: NDArray[np.bool_]) -> dict[str, Any]:
-    """Gymnasium's form of infos that every environment has: each key beside a mask, ``everywhere``."""
+def _with_masks(info: dict[str, Any], mask: NDArray[np.bool_]) -> dict[str, Any]:
+    """Gymnasium's form of infos: each key beside the ``mask``, bool [n], of the environments that have it."""
     masked: dict[str, Any] = {}
     for key, value in info.items():
-        masked[key] = _with_masks(value, everywhere) if isinstance(value, dict) else value
-        masked[f"_{key}"] = everywhere
+        masked[key] = _with_masks(value, mask) if isinstance(value, dict) else value
+        masked["_" + key] = mask
     return masked
