@@ -9,19 +9,23 @@ import pytest
 from returned import assert_same, copied, put_together
 
 from rl2grid.envs.info import episode_info
-from rl2grid.envs.info_arrays import Underway, info_arrays
-from rl2grid.envs.vector import _with_masks
+from rl2grid.envs.info_arrays import InfoForm
 from rl2grid.grids import load_grid
+from rl2grid.handles import Handle
+from rl2grid.mdp.reports import blank_report, write_report
 from rl2grid.mdp.state import GridState, new_state
 from rl2grid.structures import Role, fields_of
 
 N = 5
 GRID = load_grid("bus14")
+EPISODES = np.arange(3 * N).reshape(3, N) + 100
+OVER = np.arange(N) % 2 == 0
+NAMES = ("scenario", "game_over_text", "action_effect", "action_set_hash")
 
 
 @pytest.fixture
 def state() -> GridState:
-    """Numbers of which no two are alike."""
+    """Numbers of which hardly any two are alike."""
     random = np.random.default_rng(0)
     state = new_state(GRID, N)
     for name in fields_of(GridState, Role.KEPT):
@@ -35,60 +39,45 @@ def state() -> GridState:
     return state
 
 
-@pytest.fixture
-def underway() -> Underway:
-    return Underway(
-        np.array([f"month {i}" for i in range(N)], object),
-        np.arange(N) + 10,
-        np.arange(N) + 20,
-        np.arange(N) + 100,
-        np.arange(N) % 2 == 0,
-        np.array([f"refused: {i}" for i in range(N)], object),
-    )
-
-
-def own_info(
-    state: GridState, underway: Underway, i: int, constraint: str | None, tells_discounted: bool, digest: str | None
-) -> dict[str, Any]:
-    """The info of one environment."""
+def own_info(state: GridState, i: int, constraint: str | None) -> dict[str, Any]:
+    """The info of one environment, texts excepted."""
     info = {
-        "scenario": underway.scenarios[i],
-        "start": int(underway.starts[i]),
-        "start_redraws": int(underway.redraws[i]),
+        "start": int(EPISODES[0, i]),
+        "start_redraws": int(EPISODES[1, i]),
         **episode_info(state, i, constraint),
-        "action_effect": underway.effects[i],
+        "over": bool(OVER[i]),
+        "discounted_reward": float(state.transition_discounted[i]),
     }
-    info |= {"grid_steps": int(underway.earlier_steps[i]) + info["step"], "over": bool(underway.over[i])}
-    if tells_discounted:
-        info["discounted_reward"] = float(state.transition_discounted[i])
-    if digest:
-        info["action_set_hash"] = digest
-    return info
+    info["grid_steps"] = int(EPISODES[2, i]) + info["step"]
+    return info | {name: f"{name} {i}" for name in NAMES}
 
 
-@pytest.mark.parametrize(("constraint", "discounted", "digest"), [(None, False, None), ("TLO", True, "a1b2")])
-def test_every_environment_has_its_own_info(state, underway, constraint, discounted, digest):
-    arrays = info_arrays(state, underway, constraint, discounted, digest)
-    mine = _with_masks(arrays.named(), np.ones(N, np.bool_))
-    own = [own_info(state, underway, i, constraint, discounted, digest) for i in range(N)]
-    assert list(arrays.named()) == list(own[0])
-    assert_same(copied(mine), put_together(own))
+def infos(state: GridState, told: np.ndarray, constraint: int) -> dict[str, Any]:
+    """The infos of the environments ``told``."""
+    report = blank_report(N, GRID.n_line)
+    handle = Handle(state)
+    write_report(handle.address, np.flatnonzero(told), constraint, EPISODES, OVER, *report)
+    words = np.array([[f"{name} {i}" if told[i] else None for i in range(N)] for name in NAMES], object)
+    return InfoForm(NAMES, True).named(words, report, told)
 
 
-@pytest.mark.parametrize("ended", [[2], [0, 3, 4], list(range(N))])
-def test_only_chosen_environments_have_one(state, underway, ended):
-    chosen = np.isin(np.arange(N), ended)
-    arrays = info_arrays(state, underway, None, True, "a1b2").only(chosen)
-    mine = _with_masks({"final_info": arrays.named()}, chosen)
-    own = [{"final_info": own_info(state, underway, i, None, True, "a1b2")} if chosen[i] else {} for i in range(N)]
-    assert_same(copied(mine), put_together(own))
+@pytest.mark.parametrize(("constraint", "column"), [(None, -1), ("LSI", 0), ("TLO", 1)])
+def test_every_environment_has_its_own_info(state, constraint, column):
+    mine = infos(state, np.ones(N, np.bool_), column)
+    assert_same(copied(mine), put_together([own_info(state, i, constraint) for i in range(N)]))
 
 
-def test_infos_stay_what_they_were(state, underway):
-    named = info_arrays(state, underway, None, True, None).named()
-    before = copied(named)
-    for name in fields_of(GridState, Role.KEPT):
-        getattr(state, name)[:] = 1
-    for array in vars(underway).values():
-        array[:] = 1
-    assert_same(copied(named), before)
+@pytest.mark.parametrize("ended", [[2], [0, 3, 4]])
+def test_where_only_some_have_infos_those_of_others_are_blank(state, ended):
+    told = np.isin(np.arange(N), ended)
+    mine = {"final_info": infos(state, told, -1), "_final_info": told}
+    theirs = put_together([{"final_info": own_info(state, i, None)} if told[i] else {} for i in range(N)])
+    assert_same(copied(mine), theirs)
+
+
+def test_keys_are_there_where_they_are_meant_to_be():
+    report, everywhere = blank_report(N, GRID.n_line), np.ones(N, np.bool_)
+    named = InfoForm(["scenario"], False).named(np.full((1, N), "", object), report, everywhere)
+    assert "scenario" in named
+    assert "discounted_reward" not in named
+    assert "action_set_hash" not in named

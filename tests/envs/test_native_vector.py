@@ -273,6 +273,7 @@ def test_masks_are_those_of_the_rules():
     assert not masks[0].all()
     assert masks[0, 0]
     assert masks[1].all()
+    np.testing.assert_array_equal(masks, vector.call("action_masks"))
     with pytest.raises(UsageError, match="has continuous actions"):
         make_vector("bus14-R", 1).action_masks()
 
@@ -288,6 +289,7 @@ def test_effects_are_put_into_words_and_stay_what_they_were():
     for _ in range(3):
         vector.step([0, 0])
     assert str(effects[0]) == words
+    assert effects[1] == "", "nothing is made for a row of which there is nothing to say"
     redispatching = make_vector("bus14-R", 2, split="bundled")
     redispatching.reset(seed=0)
     said = [str(redispatching.step(np.ones((2, 6), np.float32))[-1]["action_effect"][0]) for _ in range(12)]

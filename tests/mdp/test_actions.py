@@ -148,6 +148,13 @@ def test_sampled_actions_are_legal_where_grid2op_accepts_them(make_env, grid_id)
     assert check_random_play(make_env(grid.bundled_names[0]), grid, steps=25, tried=tried, seed=1) > 50
 
 
+def test_a_run_of_the_full_catalogue_is_a_substation_or_a_line():
+    grid = load_grid("bus36-M")
+    movable = np.count_nonzero(grid.sub_info > 1)
+    assert len(full_catalogue(grid).runs) - 1 == 1 + movable + grid.n_line
+    assert full_catalogue(grid).runs[-1] == len(full_catalogue(grid))
+
+
 def check_random_play(env, grid, steps, tried, seed):
     """Compare verdicts over random legal play; returns how many illegal actions were met."""
     rng = np.random.default_rng(seed)

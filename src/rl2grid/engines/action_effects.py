@@ -11,7 +11,7 @@ from rl2grid.grids import Grid
 from rl2grid.mdp.actions import StepAction, decode_continuous
 from rl2grid.mdp.legality import AMBIGUOUS, LEGAL, LINE_COOLS_DOWN, TOO_MANY_LINES, TOO_MANY_SUBS, Verdict
 
-_TOLERANCE = 0.05
+TOLERANCE = np.float32(0.05)
 """MW below which a difference between what was asked and what happened is not worth a word."""
 
 
@@ -61,9 +61,9 @@ def clipping(grid: Grid, state: AfterAction, i: int, action: StepAction) -> str:
     parts = [
         *(f"{grid.name_gen[gen]} is dispatched by {state.actual_dispatch[i, gen]:+.1f} MW of the "
           f"{state.target_dispatch[i, gen]:+.1f} MW asked for, by its limits or to keep the balance"
-          for gen in np.flatnonzero((np.abs(missing) > _TOLERANCE) & (asked.redispatch != 0))),
+          for gen in np.flatnonzero((np.abs(missing) > TOLERANCE) & (asked.redispatch != 0))),
         *(f"{grid.name_storage[unit]} works at {state.storage_power[i, unit]:+.1f} MW instead of "
           f"{asked.storage[unit]:+.1f} MW, as it is {'full' if asked.storage[unit] > 0 else 'empty'}"
-          for unit in np.flatnonzero(np.abs(state.storage_power[i] - asked.storage) > _TOLERANCE)),
+          for unit in np.flatnonzero(np.abs(state.storage_power[i] - asked.storage) > TOLERANCE)),
     ]  # fmt: skip
     return f"clipped: {'; '.join(parts)}" if parts else ""

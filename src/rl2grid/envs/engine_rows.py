@@ -11,18 +11,26 @@ from numpy.typing import NDArray
 from rl2grid.arrays import I64, Flags
 from rl2grid.engines.worlds import World, world_of_plain
 from rl2grid.envs.description import check_action
-from rl2grid.envs.info_arrays import InfoArrays, Underway, info_arrays
+from rl2grid.envs.info import COSTS, GAME_OVER_WORDS
+from rl2grid.envs.info_arrays import InfoForm
 from rl2grid.envs.options import TaskOptions
 from rl2grid.envs.row_view import RowView, public_names
 from rl2grid.envs.rows import Batch
 from rl2grid.envs.task_environments import StreamPosition, TaskEnvironments
 from rl2grid.envs.tasks import Task
 from rl2grid.errors import UsageError, one_of
+from rl2grid.handles import Handle
+from rl2grid.mdp import reports
+from rl2grid.mdp.action_masks import write_action_masks
 from rl2grid.mdp.features import observation_size
+from rl2grid.mdp.reports import blank_report, write_report
 from rl2grid.scenarios.episodes import EpisodePlan
 
 Decisions = TypeVar("Decisions")
 """Checked actions of all rows, in the form in which the engine takes them."""
+
+_WORDS = ("scenario", "game_over_text", "action_effect")
+_NO_WORDS = np.array(None, object)
 
 
 class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
@@ -36,17 +44,22 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
         self._n = n
         self._size = observation_size(task.grid, task.kind)
         self._rows = np.arange(n)
+        self._state_handle = Handle(self.state)
         self._scenarios = np.full(n, "", object)
-        self._starts = np.zeros(n, np.int64)
-        self._redraws = np.zeros(n, np.int64)
-        self._earlier_steps = np.zeros(n, np.int64)  # grid steps of earlier episodes of a seed's stream
+        self._hashes = [] if self._hash is None else [np.full(n, self._hash, object)]
+        self._episodes = np.zeros((reports.EARLIER_STEPS + 1, n), np.int64)
+        self._starts = self._episodes[reports.START]
+        self._redraws = self._episodes[reports.START_REDRAWS]
+        self._earlier_steps = self._episodes[reports.EARLIER_STEPS]
         self._shown_effects = np.full(n, "", object)
+        self._cost = -1 if self.constraint is None else COSTS.index(self.constraint)
+        self._form = InfoForm([*_WORDS, *(["action_set_hash"] if self._hashes else [])], options.gamma is not None)
         self._all_begun = False  # every row was reset or restored once
 
     def reset(self, seeds: list[int | None], options: dict[str, Any] | None) -> Batch:
         """See :meth:`rl2grid.envs.rows.Rows.reset`."""
         self._begin(self._rows, seeds, options)
-        return self._batch(np.full(self._n, "", object))
+        return self._standing_batch(np.full(self._n, "", object))
 
     def step(self, actions: Any) -> Batch:
         """See :meth:`rl2grid.envs.rows.Rows.step`."""
@@ -61,21 +74,22 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
         effects[waiting] = ""
         state = self.state
         rewards, terminated, truncated = state.transition_reward.copy(), state.terminated.copy(), state.truncated.copy()
-        ended, endings = terminated | truncated, {}
-        if ended.any():
-            endings = self._endings(ended, effects)
-            begun = np.flatnonzero(ended)
-            self._begin(begun, [None] * len(begun), None)
-            effects[begun] = ""
-        batch = self._batch(effects)
-        batch.rewards, batch.terminated, batch.truncated, batch.endings = rewards, terminated, truncated, endings
+        ended = terminated | truncated
+        if not ended.any():
+            return self._batch(effects, rewards, terminated, truncated)
+        endings = self._endings(ended, effects)
+        begun = np.flatnonzero(ended)
+        self._begin(begun, [None] * len(begun), None)
+        effects[begun] = ""
+        batch = self._batch(effects, rewards, terminated, truncated)
+        batch.infos |= endings
         return batch
 
     def action_masks(self) -> NDArray[np.bool_]:
         """See :meth:`rl2grid.envs.rows.Rows.action_masks`."""
-        masks = np.zeros((self._n, self.task.n_actions), np.bool_)
-        for i in range(self._n):
-            self.write_action_mask(i, masks[i])
+        catalogue = self._topology_catalogue()
+        masks = np.empty((self._n, len(catalogue)), np.bool_)
+        write_action_masks(self._state_address, catalogue.runs, catalogue.kind, catalogue.target, masks)
         return masks
 
     def state_dict(self) -> list[dict[str, Any]]:
@@ -89,7 +103,7 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
             self._checked_standing(world)
         for i, world in enumerate(worlds):
             self.restore(i, world)
-        return self._batch(self._shown_effects)
+        return self._standing_batch(self._shown_effects)
 
     def restore_row(self, i: int, world: World) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """See :meth:`rl2grid.envs.rows.Rows.restore_row`."""
@@ -180,19 +194,42 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
         for action in actions:
             check_action(self.task, action)
 
+    @property
+    def _state_address(self) -> int:
+        """Where compiled code finds the state."""
+        if self._state_handle.structure is not self.state:
+            self._state_handle = Handle(self.state)
+        return self._state_handle.address
+
     def _endings(self, ended: Flags, effects: NDArray[np.object_]) -> dict[str, Any]:
-        """:attr:`Batch.endings` of the episodes that have ``ended``, bool [n]."""
+        """Infos of the episodes that have ``ended``, bool [n]: their last observations and infos, masked."""
         rows = np.flatnonzero(ended)
         observations = np.full(self._n, None, object)
         for i, observation in zip(rows.tolist(), self._last_observations(rows), strict=True):
             observations[i] = observation
-        return {"final_obs": observations, "final_info": self._infos(effects).only(ended).named()}
+        last = self._infos(rows, effects, ended)
+        return {"final_obs": observations, "_final_obs": ended, "final_info": last, "_final_info": ended}
 
-    def _infos(self, effects: NDArray[np.object_]) -> InfoArrays:
-        underway = Underway(self._scenarios, self._starts, self._redraws, self._earlier_steps, self._pending, effects)
-        return info_arrays(self.state, underway, self.constraint, self.options.gamma is not None, self._hash)
+    def _infos(self, rows: I64, effects: NDArray[np.object_], told: Flags) -> dict[str, Any]:
+        """Infos of ``rows``; those of others are blank. ``told`` is their mask, bool [n]."""
+        report = blank_report(self._n, self.grid.n_line)
+        write_report(self._state_address, rows, self._cost, self._episodes, self._pending, *report)
+        words = np.array((self._scenarios, GAME_OVER_WORDS[self.state.game_over], effects, *self._hashes), object)
+        if len(rows) < self._n:
+            words = np.where(told, words, _NO_WORDS)
+        return self._form.named(words, report, told)
 
-    def _batch(self, effects: NDArray[np.object_]) -> Batch:
+    def _standing_batch(self, effects: NDArray[np.object_]) -> Batch:
+        """Where all rows stand, no step having been played."""
+        return self._batch(effects, np.zeros(self._n), *np.zeros((2, self._n), np.bool_))
+
+    def _batch(
+        self,
+        effects: NDArray[np.object_],
+        rewards: NDArray[np.float64],
+        terminated: NDArray[np.bool_],
+        truncated: NDArray[np.bool_],
+    ) -> Batch:
         self._shown_effects = effects
-        off = np.zeros(self._n, np.bool_)
-        return Batch(self._observations(), np.zeros(self._n), off, off.copy(), self._infos(effects).named())
+        infos = self._infos(self._rows, effects, np.ones(self._n, np.bool_))
+        return Batch(self._observations(), rewards, terminated, truncated, infos)

@@ -107,15 +107,18 @@ class RemoteRows:
 
     def _together(self, batches: list[Batch]) -> Batch:
         """The batches of all workers as that of all rows."""
-        shown = next((batch.endings for batch in batches if batch.endings), {})
-        endings = [batch.endings or _blank(shown, len(batch.rewards)) for batch in batches]
+        # Only those in which an episode ended tell of endings.
+        form: dict[str, Any] = max((batch.infos for batch in batches), key=len)
+        infos = [
+            {key: batch.infos.get(key, _blank(value, len(batch.rewards))) for key, value in form.items()}
+            for batch in batches
+        ]
         return Batch(
             np.concatenate([batch.observations for batch in batches]),
             np.concatenate([batch.rewards for batch in batches]),
             np.concatenate([batch.terminated for batch in batches]),
             np.concatenate([batch.truncated for batch in batches]),
-            _joined([batch.infos for batch in batches]),
-            _joined(endings),
+            _joined(infos),
         )
 
 
@@ -137,11 +140,8 @@ def _joined(infos: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _blank(infos: dict[str, Any], n: int) -> dict[str, Any]:
-    """Infos of ``n`` rows that have none, of the form of ``infos``."""
-    return {
-        key: _blank(value, n)
-        if isinstance(value, dict)
-        else np.full((n, *value.shape[1:]), None if value.dtype == object else 0, value.dtype)
-        for key, value in infos.items()
-    }
+def _blank(form: Any, n: int) -> Any:
+    """The infos of ``n`` rows that have none, of the form of those of other rows."""
+    if isinstance(form, dict):
+        return {key: _blank(value, n) for key, value in form.items()}
+    return np.full((n, *form.shape[1:]), None if form.dtype == object else 0, form.dtype)

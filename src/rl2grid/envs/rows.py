@@ -8,7 +8,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -31,10 +31,9 @@ class Batch:
     truncated: NDArray[np.bool_]
     """bool [n]; False after a reset."""
     infos: dict[str, Any]
-    """By key of :data:`~rl2grid.envs.info.INFO_KEYS`: arrays [n] or dicts of such. Every row has every key."""
-    endings: dict[str, Any] = field(default_factory=dict)
-    """``final_obs``, object [n], and ``final_info``, as ``infos``, of the episodes that ended in this step; None, zero
-    and False in rows where none did. Empty where no row has one."""
+    """By key of :data:`~rl2grid.envs.info.INFO_KEYS`, in Gymnasium's form: arrays [n] or dicts of such, each beside its
+    mask, ``"_" + key``, of the rows that have it. All rows have all keys; where episodes ended in this step there are
+    ``final_obs``, object [n], and ``final_info``, infos again, which their rows have and which are blank in others."""
 
 
 class Rows(Protocol):

@@ -21,6 +21,7 @@ from rl2grid.envs.options import TaskOptions
 from rl2grid.envs.tasks import Task
 from rl2grid.errors import UsageError
 from rl2grid.mdp.actions import (
+    ActionCatalogue,
     StepAction,
     action_set_hash,
     inject,
@@ -187,9 +188,13 @@ class TaskEnvironments:
 
     def write_action_mask(self, i: int, out: NDArray[np.bool_]) -> None:
         """Write to ``out`` [action] which actions are legal in row ``i``."""
+        catalogue = self._topology_catalogue()
+        legal_actions(self.state, i, catalogue.kind, catalogue.target, out)
+
+    def _topology_catalogue(self) -> ActionCatalogue:
         if self._catalogue is None:
             raise UsageError(f"{self.task.id} has continuous actions: only topology tasks have action masks.")
-        legal_actions(self.state, i, self._catalogue.kind, self._catalogue.target, out)
+        return self._catalogue
 
     def simulate(self, i: int, action: Any, horizon: int) -> SimulationResult:
         """What one step of ``action`` would bring on the forecast; see :meth:`PowerGridEnv.simulate`."""

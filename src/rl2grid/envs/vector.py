@@ -16,7 +16,6 @@ from rl2grid.envs.description import TaskDescription, single_spaces
 from rl2grid.envs.making_rows import make_rows
 from rl2grid.envs.options import keyword_names, options_of, shows_options
 from rl2grid.envs.row_view import public_names
-from rl2grid.envs.rows import Batch
 from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
 
@@ -79,7 +78,8 @@ class PowerGridVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], Any, ND
         )
         if len(seeds) != self.num_envs:
             raise UsageError(f"{len(seeds)} seeds were given for {self.num_envs} environments: give one each.")
-        return self._present(self._rows.reset(seeds, options))
+        batch = self._rows.reset(seeds, options)
+        return batch.observations, batch.infos
 
     def step(
         self, actions: Any
@@ -90,8 +90,7 @@ class PowerGridVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], Any, ND
             UsageError: an action has the wrong shape or value.
         """
         batch = self._rows.step(actions)
-        observations, infos = self._present(batch)
-        return observations, batch.rewards, batch.terminated, batch.truncated, infos
+        return batch.observations, batch.rewards, batch.terminated, batch.truncated, batch.infos
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Which discrete actions are legal now, bool [environment, action]."""
@@ -182,7 +181,8 @@ class PowerGridVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], Any, ND
         rows = state["rows"]
         if len(rows) != self.num_envs:
             raise UsageError(f"The saved state has {len(rows)} environments, this vector has {self.num_envs}.")
-        return self._present(self._rows.load_state_dict(rows))
+        batch = self._rows.load_state_dict(rows)
+        return batch.observations, batch.infos
 
     def close_extras(self, **kwargs: Any) -> None:
         """Free the simulators and end the workers; nothing can be asked of the environments any more."""
@@ -193,19 +193,3 @@ class PowerGridVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], Any, ND
         if not isinstance(i, int | np.integer) or not 0 <= i < self.num_envs:
             raise UsageError(f"Environment {i!r} does not exist: give a number from 0 to {self.num_envs - 1}.")
         return int(i)
-
-    def _present(self, batch: Batch) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Observations and infos as Gymnasium wants them."""
-        infos = _with_masks(batch.infos, np.ones(self.num_envs, np.bool_))
-        if batch.endings:
-            infos |= _with_masks(batch.endings, batch.terminated | batch.truncated)
-        return batch.observations, infos
-
-
-def _with_masks(info: dict[str, Any], mask: NDArray[np.bool_]) -> dict[str, Any]:
-    """Gymnasium's form of infos: each key beside the ``mask``, bool [n], of the environments that have it."""
-    masked: dict[str, Any] = {}
-    for key, value in info.items():
-        masked[key] = _with_masks(value, mask) if isinstance(value, dict) else value
-        masked["_" + key] = mask
-    return masked

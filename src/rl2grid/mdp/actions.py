@@ -28,7 +28,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rl2grid.arrays import F32, Flags
+from rl2grid.arrays import F32, I64, Flags
 from rl2grid.compile import jit
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
@@ -220,6 +220,15 @@ class ActionCatalogue:
     """[action] line or substation."""
     mask: Masks
     """[action, word] moved elements; 0 unless the kind is MOVE."""
+
+    @functools.cached_property
+    def runs(self) -> I64:
+        """int64 [run + 1], where actions of one kind and target that follow each other begin, and where the last end.
+
+        They are legal together; in a full catalogue all moves of a substation are a run.
+        """
+        changes = (np.diff(self.kind) != 0) | (np.diff(self.target) != 0)
+        return np.concatenate(([0], 1 + np.flatnonzero(changes), [len(self)]))
 
     def __len__(self) -> int:
         return len(self.kind)

@@ -93,7 +93,7 @@ def advance(
             state.decisions[i] += 1
             _order(orders, i, k, first, kinds, targets, masks, injects, values)
             _step(environments, i, reward, weights, gamma)
-            note_action(environments.notes, orders, state, i)
+            note_action(environments.notes, environments.constants, orders, state, i)
             illegal, ambiguous = state.illegal[i], state.ambiguous[i]
             if heuristic >= CAREFUL:
                 remember_topology(state, i)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rl2grid.arrays import F32, I64, U64, Flags
 from rl2grid.engines.action_effects import clipping, refusal
-from rl2grid.engines.native.action_notes import ActionNotes, copy_notes, verdict_in
+from rl2grid.engines.native.action_notes import ActionNotes, notes_of, verdict_in
 from rl2grid.engines.native.advance import (
     ALONE,
     CAREFUL,
@@ -138,18 +138,36 @@ def commands_of(grid: Grid, actions: Sequence[StepAction]) -> Commands:
     )
 
 
+@dataclass(frozen=True)
+class NotedActions:
+    """Actions of a step of which something was refused or clipped."""
+
+    grid: Grid
+    commands: Commands
+    rows: I64
+    """int64 [k], their entries in ``commands``."""
+    notes: ActionNotes
+    """What became of them, ``k`` environments."""
+
+    def in_words(self, k: int) -> str:
+        """What was refused or clipped of one of them, and why."""
+        return _in_words(self.grid, self.notes, k, self.commands.action(int(self.rows[k])))
+
+
+def _in_words(grid: Grid, notes: ActionNotes, i: int, action: StepAction) -> str:
+    return refusal(grid, verdict_in(notes, i)) or clipping(grid, notes, i, action)
+
+
 class ActionEffect:
-    """What became of one agent's action; put into words when somebody reads it."""
+    """What was refused or clipped of one agent's action; put into words when somebody reads it."""
 
-    __slots__ = ("_commands", "_grid", "_notes", "_row")
+    __slots__ = ("_k", "_noted")
 
-    def __init__(self, grid: Grid, notes: ActionNotes, commands: Commands, row: int) -> None:
-        self._grid, self._notes, self._commands, self._row = grid, notes, commands, row
+    def __init__(self, noted: NotedActions, k: int) -> None:
+        self._noted, self._k = noted, k
 
     def __str__(self) -> str:
-        action = self._commands.action(self._row)
-        refused = refusal(self._grid, verdict_in(self._notes, self._row))
-        return refused or clipping(self._grid, self._notes, self._row, action)
+        return self._noted.in_words(self._k)
 
     __repr__ = __str__
 
@@ -199,8 +217,7 @@ class NativeTransitions(Transitions):
             return
         self._advance_part(0, self._rows[i : i + 1], commands_of(self.engine.grid, [action]), False)
         notes = self.engine.environments.notes
-        refused = refusal(self.engine.grid, verdict_in(notes, i))
-        self.action_effects[i] = refused or clipping(self.engine.grid, notes, i, action)
+        self.action_effects[i] = _in_words(self.engine.grid, notes, i, action) if notes.worth_a_word[i] else ""
 
     def play_rows(self, rows: I64, commands: Commands, num_threads: int) -> None:
         """Play one transition in each of ``rows``, entry k of ``commands`` in row ``rows[k]``."""
@@ -254,12 +271,16 @@ class NativeTransitions(Transitions):
         write_observations(self.engine.address, rows, self.topology_task, shift, scale, out)
 
     def action_effects_of(self, commands: Commands) -> NDArray[np.object_]:
-        """What became of the actions of all environments, object [n]."""
+        """What became of the actions of all environments, object [n]: an empty text, or what ``str`` makes one of."""
         if not self.is_compiled:
             return np.array([self.action_effects[i] for i in range(len(commands))], object)
-        grid, notes = self.engine.grid, copy_notes(self.engine.environments.notes)
-        effects = np.empty(len(commands), object)
-        effects[:] = [ActionEffect(grid, notes, commands, i) for i in range(len(effects))]
+        effects = np.full(len(commands), "", object)
+        notes = self.engine.environments.notes
+        rows = np.flatnonzero(notes.worth_a_word)
+        if len(rows):
+            noted = NotedActions(self.engine.grid, commands, rows, notes_of(notes, rows))
+            for k, i in enumerate(rows.tolist()):
+                effects[i] = ActionEffect(noted, k)
         return effects
 
     def _advance(self, rows: I64, commands: Commands, num_threads: int, begins: bool) -> None:
