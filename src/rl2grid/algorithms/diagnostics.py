@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable
 
 import numpy as np
+import torch
 from torch import Tensor
 
 
@@ -22,5 +23,5 @@ def explained_variance(values: Tensor, returns: Tensor) -> float:
 
 def mean(scalars: Iterable[Tensor]) -> float:
     """Mean of scalars, NaN if there are none."""
-    values = [float(scalar) for scalar in scalars]
-    return float(np.mean(values)) if values else math.nan
+    values = list(scalars)
+    return float(np.mean(torch.stack(values).tolist())) if values else math.nan

@@ -191,7 +191,7 @@ class QNetwork(nn.Module):
 
     def forward(self, observations: Tensor) -> Tensor:
         """Q of observations [batch, size] -> [batch, actions]: the least of what the networks say."""
-        return self.each(observations).min(dim=0).values
+        return self.each(observations).amin(dim=0)
 
     def each(self, observations: Tensor) -> Tensor:
         """What every network says of observations [batch, size] -> [networks, batch, actions]."""
@@ -289,7 +289,7 @@ class DQN(OffPolicyTrainer):
         played = batch.actions.expand(self.args.networks, -1).unsqueeze(-1)
         values = self.network.each(batch.observations).gather(-1, played).squeeze(-1)
         error = torch.stack([loss(each, aims, self.args.huber_delta) for each in values]).sum()
-        self._descend(self.optimizer, error, self.network)
+        self._descend(self.optimizer, error)
         renewals = self.decisions // self.args.target_frequency
         if renewals > self._renewals:
             self._renewals = renewals

@@ -38,12 +38,14 @@ from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from rl2grid.algorithms.descent import Adam, descend
 from rl2grid.algorithms.hyperparameters import SharedArgs
 from rl2grid.algorithms.networks import VALUE_OF_ACTION, NetworkFactory
 from rl2grid.algorithms.playing import Tally
 from rl2grid.algorithms.replay import ReplayMemory, Step, computer_memory
+from rl2grid.algorithms.sampling import drawn
 from rl2grid.algorithms.trainer import Trainer
-from rl2grid.envs.normalization import ObservationNormalizer
+from rl2grid.envs.normalization import CLIP, ObservationNormalizer
 
 # --- Hyperparameters ------------------------------------------------------------------------------------------------
 
@@ -109,8 +111,7 @@ class TwinCritics(nn.Module):
 def follow(target: nn.Module, online: nn.Module, tau: float) -> None:
     """Move the weights of ``target`` by the share ``tau`` of the way to those of ``online``."""
     with torch.no_grad():
-        for mine, theirs in zip(target.parameters(), online.parameters(), strict=True):
-            mine.lerp_(theirs, tau)
+        torch._foreach_lerp_(list(target.parameters()), list(online.parameters()), tau)
 
 
 def random_legal_actions(
@@ -126,16 +127,19 @@ def random_legal_actions(
         do_nothing: Probability of action 0, on top of its share of the rest; None: it is one like the others.
     """
     weights = torch.ones(count, action_size) if masks is None else masks.to(torch.float32)
-    actions = torch.multinomial(weights, 1, generator=generator).squeeze(-1)
+    actions = drawn(weights, generator)
     if do_nothing is None:
         return actions
     return torch.where(torch.rand(count, generator=generator) < do_nothing, 0, actions)
 
 
-def adam(network: nn.Module, learning_rate: float) -> torch.optim.Adam:
-    """Adam for all weights of a network; fused, because networks are small and calls cost more than arithmetic."""
-    return torch.optim.Adam(network.parameters(), lr=learning_rate, fused=True)
+def adam(network: nn.Module, learning_rate: float) -> Adam:
+    """Adam for all weights of a network."""
+    return Adam(network.parameters(), lr=learning_rate)
 
+
+LEAST_VARIANCE = 1e-8
+"""Added to the variance of every feature before it is divided by, as :class:`ObservationNormalizer` does."""
 
 # --- Training -------------------------------------------------------------------------------------------------------
 
@@ -173,6 +177,7 @@ class OffPolicyTrainer(Trainer):
         """
         super().__init__(args, envs)
         self.normalizer = ObservationNormalizer(self.observation_size) if args.normalize_observations else None
+        self._scaled_at = -1
         self.memory = ReplayMemory(
             num_envs=args.num_envs,
             observation_size=self.observation_size,
@@ -227,16 +232,16 @@ class OffPolicyTrainer(Trainer):
 
     def minibatch(self) -> Batch:
         """Transitions drawn from the memory."""
-        drawn = self.memory.draw(self.args.batch_size)
-        actions = torch.as_tensor(drawn.actions)
+        batch = self.memory.draw(self.args.batch_size)
+        actions = self._moved(batch.actions)
         return Batch(
-            self.tensor(self._normalized(drawn.observations)),
-            None if drawn.masks is None else self.tensor(drawn.masks),
-            (actions if self.continuous else actions.to(torch.int64)).to(self.device),
-            self.tensor(drawn.rewards),
-            self.tensor(drawn.discounts),
-            self.tensor(self._normalized(drawn.next_observations)),
-            None if drawn.next_masks is None else self.tensor(drawn.next_masks),
+            self._normalized(batch.observations),
+            None if batch.masks is None else self._moved(batch.masks),
+            actions if self.continuous else actions.to(torch.int64),
+            self._moved(batch.rewards),
+            self._moved(batch.discounts),
+            self._normalized(batch.next_observations),
+            None if batch.next_masks is None else self._moved(batch.next_masks),
         )
 
     def normalizer_state(self) -> dict[str, Any] | None:
@@ -278,9 +283,8 @@ class OffPolicyTrainer(Trainer):
         assert observations is not None
         masks = self.envs.action_masks() if args.mask_actions else None  # type: ignore[attr-defined]
         with torch.no_grad():
-            actions = self.explore(
-                self.tensor(self._normalized(observations)), None if masks is None else torch.as_tensor(masks)
-            ).cpu()
+            shown = self._normalized(observations)
+            actions = self.explore(shown, None if masks is None else torch.as_tensor(masks)).cpu()
         played = self.step(actions.numpy(), tally)
         ended_well = np.flatnonzero(played.completed).tolist()
         self.memory.add(
@@ -304,15 +308,30 @@ class OffPolicyTrainer(Trainer):
             self.updates += 1
             history.note(self.learn(self.minibatch()))
 
-    def _normalized(self, observations: NDArray[np.float32]) -> NDArray[np.float32]:
-        return observations if self.normalizer is None else self.normalizer.normalize(observations)
+    def _moved(self, values: NDArray[Any]) -> Tensor:
+        """An array on the networks' device, the same memory if that is the processor's."""
+        return torch.from_numpy(np.ascontiguousarray(values)).to(self.device)
 
-    def _descend(self, optimizer: torch.optim.Optimizer, loss: Tensor, network: nn.Module) -> None:
-        """One step down the gradient of a network's loss."""
-        optimizer.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
-        nn.utils.clip_grad_norm_(network.parameters(), self.args.max_grad_norm)
-        optimizer.step()
+    def _normalized(self, observations: NDArray[np.float32]) -> Tensor:
+        """Observations [..., size] as networks read them; in float32, which rounds otherwise than ``normalizer``."""
+        given = self._moved(observations)
+        if self.normalizer is None:
+            return given
+        mean, factor = self._scale()
+        return ((given - mean) * factor).clamp_(-CLIP, CLIP)
+
+    def _scale(self) -> tuple[Tensor, Tensor]:
+        """Mean, and reciprocal standard deviation, of every feature so far, float32 [size]."""
+        assert self.normalizer is not None
+        if self._scaled_at != self.normalizer.count:
+            self._scaled_at = self.normalizer.count
+            factors = 1.0 / np.sqrt(self.normalizer.variance + LEAST_VARIANCE)
+            self._mean, self._factor = (self.tensor(each, torch.float32) for each in (self.normalizer.mean, factors))
+        return self._mean, self._factor
+
+    def _descend(self, optimizer: torch.optim.Optimizer, loss: Tensor) -> None:
+        """One step down the gradient of a loss."""
+        descend(optimizer, loss, self.args.max_grad_norm)
 
 
 class _History:

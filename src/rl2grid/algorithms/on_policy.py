@@ -41,10 +41,12 @@ from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from rl2grid.algorithms.descent import Adam, descend
 from rl2grid.algorithms.diagnostics import mean
 from rl2grid.algorithms.hyperparameters import SharedArgs
 from rl2grid.algorithms.networks import PER_ACTION, VALUE, NetworkFactory, orthogonal
 from rl2grid.algorithms.playing import Tally
+from rl2grid.algorithms.sampling import drawn
 from rl2grid.algorithms.trainer import Played, Trainer
 from rl2grid.envs.normalization import NormalizeObservation
 
@@ -154,8 +156,18 @@ class ActorCritic(nn.Module):
         log_probabilities = _log_probabilities(output, masks)
         if generator is None:
             return log_probabilities.argmax(dim=-1)
-        actions = torch.multinomial(log_probabilities.exp().cpu(), 1, generator=generator)
-        return actions.squeeze(-1).to(output.device)
+        return drawn(log_probabilities.exp(), generator).to(output.device)
+
+    def sample(self, observations: Tensor, masks: Tensor | None, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """What ``act`` returns, and the log-probabilities of it [batch]."""
+        output = self.actor(observations)
+        if self.continuous:
+            noise = torch.randn(output.shape, generator=generator).to(output.device)
+            actions = output + self.log_std.exp() * noise
+            return actions, self._log_densities(output, actions)
+        log_probabilities = _log_probabilities(output, masks)
+        actions = drawn(log_probabilities.exp(), generator).to(output.device)
+        return actions, log_probabilities.gather(-1, actions.unsqueeze(-1)).squeeze(-1)
 
     def preferences(self, observations: Tensor, masks: Tensor | None) -> Tensor:
         """Probabilities of discrete actions, [batch, actions]."""
@@ -167,13 +179,17 @@ class ActorCritic(nn.Module):
         """Of the actions (as ``act`` returned them), and of the policy, each [batch]."""
         output = self.actor(observations)
         if self.continuous:
-            deviations = (actions - output) / self.log_std.exp()
-            log_densities = -0.5 * deviations.square() - self.log_std - 0.5 * math.log(2 * math.pi)
             entropy = (self.log_std + 0.5 * math.log(2 * math.pi * math.e)).sum()
-            return log_densities.sum(dim=-1), entropy.expand(len(actions))
+            return self._log_densities(output, actions), entropy.expand(len(actions))
         log_probabilities = _log_probabilities(output, masks)
         entropies = -(log_probabilities.exp() * log_probabilities).sum(dim=-1)
         return log_probabilities.gather(-1, actions.unsqueeze(-1)).squeeze(-1), entropies
+
+    def _log_densities(self, means: Tensor, actions: Tensor) -> Tensor:
+        """Of continuous actions [batch, dimensions], [batch]."""
+        deviations = (actions - means) / self.log_std.exp()
+        log_densities = -0.5 * deviations.square() - self.log_std - 0.5 * math.log(2 * math.pi)
+        return log_densities.sum(dim=-1)
 
 
 def _log_probabilities(logits: Tensor, masks: Tensor | None) -> Tensor:
@@ -278,7 +294,9 @@ class Minibatch:
 
     def rows(self, chosen: Tensor) -> Self:
         """The transitions with these indices, int64 [batch]."""
-        columns: dict[str, Any] = {name: None if array is None else array[chosen] for name, array in vars(self).items()}
+        columns: dict[str, Any] = {
+            name: None if array is None else array.index_select(0, chosen) for name, array in vars(self).items()
+        }
         return type(self)(**columns)
 
 
@@ -326,7 +344,8 @@ class OnPolicyTrainer(Trainer):
         self.network.to(self.device)
         critics = (self.network.critic, *self.network.cost_critics)
         self._groups = (self.network.actor_parameters(), *(list(critic.parameters()) for critic in critics))
-        self.optimizer = torch.optim.Adam([{"params": parameters} for parameters in self._groups], eps=1e-5)
+        groups = [{"params": parameters} for parameters in self._groups]
+        self.optimizer = Adam(groups, lr=args.actor_learning_rate, eps=1e-5)
 
     @abstractmethod
     def update(self, rollout: Any) -> dict[str, float]:
@@ -369,8 +388,7 @@ class OnPolicyTrainer(Trainer):
         observations = self.tensor(self.observations, torch.float32)
         masks = self.tensor(self.envs.action_masks()) if args.mask_actions else None  # type: ignore[attr-defined]
         with torch.no_grad():
-            actions = network.act(observations, masks, self.generator)
-            log_probabilities, _ = network.log_probability_and_entropy(observations, actions, masks)
+            actions, log_probabilities = network.sample(observations, masks, self.generator)
             values = network.value(observations)
         played = self.step(self._playable(actions), tally)
         self.observations = played.observations
@@ -447,9 +465,5 @@ class OnPolicyTrainer(Trainer):
 
     def _descend(self, batch: Minibatch) -> Losses:
         loss = self.losses(batch)
-        self.optimizer.zero_grad()
-        loss.total.backward()  # type: ignore[no-untyped-call]
-        for parameters in self._groups:
-            nn.utils.clip_grad_norm_(parameters, self.args.max_grad_norm)
-        self.optimizer.step()
+        descend(self.optimizer, loss.total, self.args.max_grad_norm)
         return replace(loss, total=loss.total.detach())

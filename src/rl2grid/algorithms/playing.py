@@ -104,7 +104,7 @@ class Tally:
         self._began = time.perf_counter()
         self._environment_seconds = 0.0
         self._decisions = self._grid_steps = self._ineffective = 0
-        self._episodes: dict[str, list[float]] = {}
+        self._episodes: dict[str, list[NDArray[Any]]] = {}
 
     def note(
         self,
@@ -125,19 +125,20 @@ class Tally:
         self._ineffective += int((illegal | ambiguous).sum())
         if not ended.any():
             return
-        self._episodes.setdefault("charts/episodic_return", []).extend(episode_returns[ended].tolist())
-        self._episodes.setdefault("charts/episodic_length", []).extend(episode_lengths[ended].tolist())
+        self._episodes.setdefault("charts/episodic_return", []).append(episode_returns[ended])
+        self._episodes.setdefault("charts/episodic_length", []).append(episode_lengths[ended])
         final = infos.get("final_info", {})
         for metric, path in _OF_EPISODES.items():
             values = _entry(final, path)
             if values is not None:
-                self._episodes.setdefault(metric, []).extend(np.asarray(values)[ended].tolist())
+                self._episodes.setdefault(metric, []).append(np.asarray(values)[ended])
 
     def metrics(self) -> dict[str, float]:
         """Means over decisions and over the episodes that ended (none of the latter if none did)."""
+        episodes = {name: np.concatenate(values).astype(np.float64) for name, values in self._episodes.items()}
         return {
-            **{name: float(np.mean(values)) for name, values in self._episodes.items()},
-            "charts/episodes": float(len(self._episodes.get("charts/episodic_return", ()))),
+            **{name: float(values.mean()) for name, values in episodes.items()},
+            "charts/episodes": float(len(episodes.get("charts/episodic_return", ()))),
             "charts/n_steps_per_decision": self._grid_steps / self._decisions,
             "charts/ineffective_actions": self._ineffective / self._decisions,
             "charts/environment_share": self._environment_seconds / (time.perf_counter() - self._began),

@@ -57,6 +57,7 @@ from rl2grid.algorithms.off_policy import (
     random_legal_actions,
 )
 from rl2grid.algorithms.registry import Algorithm
+from rl2grid.algorithms.sampling import drawn
 
 # --- Hyperparameters ------------------------------------------------------------------------------------------------
 
@@ -244,9 +245,7 @@ class CategoricalActor(nn.Module):
         if generator is None:
             best: Tensor = log_probabilities.argmax(dim=-1)
             return best
-        # Drawn on the processor, where the generator is.
-        probabilities = log_probabilities.exp().cpu()
-        return torch.multinomial(probabilities, 1, generator=generator).squeeze(-1)
+        return drawn(log_probabilities.exp(), generator)
 
     def preferences(self, observations: Tensor, masks: Tensor | None) -> Tensor:
         """Probabilities of the actions, [batch, actions]."""
@@ -429,7 +428,7 @@ class SAC(OffPolicyTrainer):
             aims = batch.rewards + batch.discounts * self.objective.next_values(batch, alpha, self._noise(batch))
         values = self.objective.values(batch)
         error = critic_loss(values, aims)
-        self._descend(self.critic_optimizer, error, self.critics)
+        self._descend(self.critic_optimizer, error)
         metrics = {"losses/qf_loss": error, "losses/qf_values": values.mean(), "losses/alpha": alpha}
         if self.updates % args.policy_frequency == 0:
             metrics |= self._improve_policy(batch, alpha)
@@ -438,13 +437,13 @@ class SAC(OffPolicyTrainer):
 
     def _improve_policy(self, batch: Batch, alpha: Tensor) -> dict[str, Tensor]:
         policy = self.objective.policy_loss(batch, alpha, self._noise(batch))
-        self._descend(self.actor_optimizer, policy.loss, self.actor)
+        self._descend(self.actor_optimizer, policy.loss)
         metrics = {"losses/actor_loss": policy.loss, "losses/entropy": policy.entropies.mean()}
         if not self.args.tune_temperature:
             return metrics
         aims = self.target_entropies(batch)
         loss = temperature_loss(self.temperature.logarithm, policy.entropies, aims)
-        self._descend(self.temperature_optimizer, loss, self.temperature)
+        self._descend(self.temperature_optimizer, loss)
         return {**metrics, "losses/alpha_loss": loss, "losses/target_entropy": aims.mean()}
 
     def _noise(self, batch: Batch) -> Tensor:

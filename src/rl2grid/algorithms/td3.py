@@ -231,12 +231,12 @@ class TD3(OffPolicyTrainer):
         aims = targets(self.slow_actor, self.slow_critics, batch, noise.to(self.device), args.noise_clip)
         values = self.critics(batch.observations, batch.actions)
         error = critic_loss(values, aims)
-        self._descend(self.critic_optimizer, error, self.critics)
+        self._descend(self.critic_optimizer, error)
         metrics = {"losses/qf_loss": error, "losses/qf_values": values.mean()}
         if self.updates % args.policy_frequency:
             return metrics
         actor_loss = -self.critics.first(batch.observations, self.actor(batch.observations)).mean()
-        self._descend(self.actor_optimizer, actor_loss, self.actor)
+        self._descend(self.actor_optimizer, actor_loss)
         follow(self.slow_actor, self.actor, args.tau)
         follow(self.slow_critics, self.critics, args.tau)
         return {**metrics, "losses/actor_loss": actor_loss}

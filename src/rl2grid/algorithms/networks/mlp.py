@@ -5,12 +5,26 @@ from __future__ import annotations
 import itertools
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from rl2grid.algorithms.networks import Network, Request
 
 
-def build(request: Request) -> nn.Sequential:
+class Layers(nn.Sequential):
+    """Layers one after the other, called without what ``Sequential`` and ``Linear`` do around the arithmetic."""
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """Numbers [..., inputs] -> [..., width]."""
+        for layer in self._modules.values():
+            if isinstance(layer, nn.Linear):
+                inputs = nn.functional.linear(inputs, layer.weight, layer.bias)
+            else:
+                assert layer is not None
+                inputs = layer(inputs)
+        return inputs
+
+
+def build(request: Request) -> Layers:
     """Linear layers of the widths asked for, with activations in between."""
     widths = (request.output.inputs(request.spec), *request.layers, request.output.width(request.spec))
     modules: list[nn.Module] = []
@@ -21,7 +35,7 @@ def build(request: Request) -> nn.Sequential:
     if request.first_action is not None:
         with torch.no_grad():
             layer.bias[request.output.per_state] = request.first_action
-    return nn.Sequential(*modules)
+    return Layers(*modules)
 
 
 NETWORK = Network("mlp", build)
