@@ -611,7 +611,7 @@ def test_a_resumed_run_ends_with_the_weights_of_one_that_was_not_interrupted(con
         for mine, theirs in zip(resumed.multipliers, straight.multipliers, strict=True):
             np.testing.assert_array_equal(mine, theirs)
         np.testing.assert_array_equal(resumed.account.running, straight.account.running)
-        assert resumed.envs.normaliser_hash == straight.envs.normaliser_hash  # type: ignore[attr-defined]
+        assert resumed.normalizer.normaliser_hash == straight.normalizer.normaliser_hash
         for name in metrics.keys() - {"charts/environment_share"}:
             assert metrics[name] == straight_metrics[-1][name], name
 
@@ -697,7 +697,7 @@ def test_as_an_agent_it_plays_its_most_probable_action():
     assert agent.name == "lagrangian-ppo"
     agent.bind(env)
     observation, info = env.reset()
-    normalised = torch.as_tensor(learner.envs.normalizer.normalize(observation[None]))  # type: ignore[attr-defined]
+    normalised = torch.as_tensor(learner.normalizer.normalize(observation[None]))
     with torch.no_grad():
         logits = learner.network.actor(normalised)[0].masked_fill(~torch.as_tensor(env.action_masks()), -np.inf)
     assert agent.act(observation, info) == int(logits.argmax())

@@ -67,7 +67,7 @@ def test_a_loaded_policy_plays_the_deterministic_actions_of_the_trained_one(cont
     assert isinstance(agent, Agent)
     env = SingleToyGrid(TASKS[continuous])
     agent.bind(env)
-    normalizer = ppo.envs.normalizer  # type: ignore[attr-defined]
+    normalizer = ppo.normalizer
     for position in np.linspace(-0.9, 0.9, 7):
         env._row.position = float(position)
         observation = env._row.observation()
@@ -93,7 +93,7 @@ def test_evaluation_repeats_itself_and_changes_nothing(continuous: bool):
     assert PolicyAgent(contents(ppo)).identity == before
     assert agent._normalizer is not None
     assert agent._normalizer.normaliser_hash == before["normaliser_hash"]
-    assert ppo.envs.normaliser_hash == before["normaliser_hash"]  # type: ignore[attr-defined]
+    assert ppo.normalizer.normaliser_hash == before["normaliser_hash"]  # type: ignore[attr-defined]
     assert agent._normalizer.frozen
 
 

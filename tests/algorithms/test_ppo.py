@@ -195,13 +195,13 @@ def test_values_at_truncation_are_of_normalised_observations():
     ppo = PPO(replace(SMALL, num_steps=100, total_timesteps=400), envs)
     first_rollout(ppo)
     envs.answers.clear()
-    ppo.envs.freeze()  # type: ignore[attr-defined]
+    ppo.normalizer.freeze()
     rollout = first_rollout(ppo)
     truncated = np.stack([answer[3] & ~answer[2] for answer in envs.answers])
     last = np.stack([envs.answers[k][4]["final_obs"][i] for k, i in np.argwhere(truncated)])
     assert len(last) > 3
     with torch.no_grad():
-        expected = ppo.network.value(torch.as_tensor(ppo.envs.normalizer.normalize(last)))  # type: ignore[attr-defined]
+        expected = ppo.network.value(torch.as_tensor(ppo.normalizer.normalize(last)))
     torch.testing.assert_close(rollout.next_values[torch.as_tensor(truncated)], expected)
 
 
@@ -525,7 +525,7 @@ def test_a_resumed_run_ends_with_the_weights_of_one_that_was_not_interrupted(con
             metrics = resumed.iterate()
         assert_same(weights(resumed), weights(straight))
         assert resumed.grid_steps == straight.grid_steps
-        assert resumed.envs.normaliser_hash == straight.envs.normaliser_hash  # type: ignore[attr-defined]
+        assert resumed.normalizer.normaliser_hash == straight.normalizer.normaliser_hash
         for name in metrics.keys() - {"charts/environment_share"}:
             assert metrics[name] == straight_metrics[-1][name], name
 
@@ -534,7 +534,7 @@ def test_a_run_is_not_resumed_in_other_environments():
     begun = trainer()
     begun.iterate()
     state = begun.state_dict()
-    state["envs"]["env"]["rows"][0]["seed"] += 1
+    state["envs"]["rows"][0]["seed"] += 1
     with pytest.raises(UsageError, match="do not come back"):
         trainer().load_state_dict(state)
 
@@ -544,7 +544,7 @@ def test_observations_are_counted_once(continuous: bool):
     ppo = trainer(continuous)
     ppo.iterate()
     ppo.iterate()
-    assert ppo.envs.normalizer.count == 4 * (2 * 16 + 1)  # type: ignore[attr-defined]
+    assert ppo.normalizer.count == 4 * (2 * 16 + 1)
 
 
 def test_the_budget_is_never_exceeded():
@@ -713,7 +713,7 @@ def test_cartpole_is_learned():
     ppo = PPO(cartpole_args(2), cartpole(8))
     while not ppo.finished:
         ppo.iterate()
-    normalizer = ppo.envs.normalizer  # type: ignore[attr-defined]
+    normalizer = ppo.normalizer
     normalizer.freeze()
     envs = cartpole(10)
     observations, _ = envs.reset(seed=1000)

@@ -43,7 +43,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -55,9 +55,9 @@ from torch import Tensor
 from rl2grid.algorithms import on_policy, ppo
 from rl2grid.algorithms.diagnostics import explained_variance, mean
 from rl2grid.algorithms.hyperparameters import changed_preset
-from rl2grid.algorithms.on_policy import ActorCritic, generalized_advantages, values_that_follow
+from rl2grid.algorithms.on_policy import ActorCritic, generalized_advantages
 from rl2grid.algorithms.on_policy import load_policy as load_policy
-from rl2grid.algorithms.playing import Tally, reported
+from rl2grid.algorithms.playing import reported
 from rl2grid.algorithms.registry import Algorithm
 from rl2grid.algorithms.trainer import Played
 from rl2grid.errors import UsageError, one_of
@@ -260,17 +260,12 @@ class LagrangianPPO(ppo.PPO):
         names = _metric_names("lagrangian/multiplier", self.constraints)
         return metrics | dict(zip(names, self.multipliers.current.tolist(), strict=True))
 
-    def collect(self) -> tuple[Rollout, dict[str, float]]:
+    def collect(self) -> tuple[on_policy.Rollout, dict[str, float]]:
         """Play one rollout."""
         self.account.forget()
+        self._costs: list[NDArray[np.float64]] = []
         rollout, metrics = super().collect()
-        assert isinstance(rollout, Rollout)
-        with torch.no_grad():
-            last_values = self.network.cost_values(self.tensor(self.observations, torch.float32))
-        following = values_that_follow(
-            rollout.cost_values, last_values, rollout.next_cost_values, rollout.ended.unsqueeze(-1)
-        )
-        return replace(rollout, next_cost_values=following), {**metrics, **self.account.metrics()}
+        return rollout, {**metrics, **self.account.metrics()}
 
     def begin_episodes(self, infos: Mapping[str, Any], begun: NDArray[np.bool_]) -> None:
         """See :class:`Trainer`."""
@@ -278,25 +273,22 @@ class LagrangianPPO(ppo.PPO):
         if self.observations is None:  # later episodes begin when the costs of those before have been counted
             self.account.begin(infos, begun)
 
-    def _play(self, tally: Tally) -> tuple[Rollout, Played]:
-        """One decision in every environment: a step of a rollout, with what it cost."""
-        step, played = super()._play(tally)
+    def note(self, played: Played) -> None:
+        """Count what the step has cost."""
         costs = costs_of_transition(played, self.constraints)
         self.account.note(played, costs)
-        at_ends = torch.zeros(len(costs), len(self.constraints), device=self.device)
-        with torch.no_grad():
-            cost_values = self.network.cost_values(step.observations)
-            if played.completed.any():
-                last = self.tensor(np.stack(played.last_observations()), torch.float32)
-                at_ends[self.tensor(played.completed)] = self.network.cost_values(last)
-        with_costs = Rollout(
-            **vars(step),
-            costs=self.tensor(costs * self.cost_scale, torch.float32),
-            cost_discounts=self.tensor(self.cost_gamma**played.n_steps, torch.float32),
+        self._costs.append(costs)
+
+    def rollout(self, record: on_policy.Record) -> Rollout:
+        """What an update needs to know of the steps of a rollout, with what they cost."""
+        cost_values, next_cost_values = record.values(self.network.cost_values)
+        return Rollout(
+            **vars(super().rollout(record)),
+            costs=self.tensor(np.stack(self._costs) * self.cost_scale, torch.float32),
+            cost_discounts=self.tensor(self.cost_gamma**record.n_steps, torch.float32),
             cost_values=cost_values,
-            next_cost_values=at_ends,
+            next_cost_values=next_cost_values,
         )
-        return with_costs, played
 
     def transitions(self, rollout: on_policy.Rollout) -> Minibatch:
         """All transitions of a rollout, with what the policy and the critics learn from them."""

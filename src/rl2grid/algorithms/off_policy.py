@@ -35,7 +35,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from gymnasium.vector import VectorEnv
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from rl2grid.algorithms.descent import Adam, descend
@@ -45,7 +44,6 @@ from rl2grid.algorithms.playing import Tally
 from rl2grid.algorithms.replay import ReplayMemory, Step, computer_memory
 from rl2grid.algorithms.sampling import drawn
 from rl2grid.algorithms.trainer import Trainer
-from rl2grid.envs.normalization import CLIP, ObservationNormalizer
 
 # --- Hyperparameters ------------------------------------------------------------------------------------------------
 
@@ -138,9 +136,6 @@ def adam(network: nn.Module, learning_rate: float) -> Adam:
     return Adam(network.parameters(), lr=learning_rate)
 
 
-LEAST_VARIANCE = 1e-8
-"""Added to the variance of every feature before it is divided by, as :class:`ObservationNormalizer` does."""
-
 # --- Training -------------------------------------------------------------------------------------------------------
 
 
@@ -176,8 +171,6 @@ class OffPolicyTrainer(Trainer):
             UsageError: the environments cannot be learned with these hyperparameters.
         """
         super().__init__(args, envs)
-        self.normalizer = ObservationNormalizer(self.observation_size) if args.normalize_observations else None
-        self._scaled_at = -1
         self.memory = ReplayMemory(
             num_envs=args.num_envs,
             observation_size=self.observation_size,
@@ -215,7 +208,7 @@ class OffPolicyTrainer(Trainer):
     def iterate(self) -> dict[str, float]:
         """Play ``num_steps`` decisions in every environment, learning on the way, and return the metrics."""
         if self.observations is None:
-            self._see(self.reset())
+            self.see(self.reset())
         tally, history = Tally(), _History()
         for _ in range(self.args.num_steps):
             self._play(tally)
@@ -233,26 +226,21 @@ class OffPolicyTrainer(Trainer):
     def minibatch(self) -> Batch:
         """Transitions drawn from the memory."""
         batch = self.memory.draw(self.args.batch_size)
-        actions = self._moved(batch.actions)
+        actions = self.moved(batch.actions)
         return Batch(
-            self._normalized(batch.observations),
-            None if batch.masks is None else self._moved(batch.masks),
+            self.normalized(batch.observations),
+            None if batch.masks is None else self.moved(batch.masks),
             actions if self.continuous else actions.to(torch.int64),
-            self._moved(batch.rewards),
-            self._moved(batch.discounts),
-            self._normalized(batch.next_observations),
-            None if batch.next_masks is None else self._moved(batch.next_masks),
+            self.moved(batch.rewards),
+            self.moved(batch.discounts),
+            self.normalized(batch.next_observations),
+            None if batch.next_masks is None else self.moved(batch.next_masks),
         )
-
-    def normalizer_state(self) -> dict[str, Any] | None:
-        """See :class:`Trainer`."""
-        return None if self.normalizer is None else self.normalizer.state_dict()
 
     def state_dict(self) -> dict[str, Any]:
         """All that is needed to go on, after an iteration; of a finished run, the memory is not."""
         return {
             **super().state_dict(),
-            "normalizer": self.normalizer_state(),
             "memory": None if self.finished else self.memory.state_dict(),
             "updates": self.updates,
         }
@@ -263,19 +251,10 @@ class OffPolicyTrainer(Trainer):
         Raises:
             UsageError: the environments, played again, are not where they were, or the memory's files are gone.
         """
-        if self.normalizer is not None:
-            self.normalizer.load_state_dict(state["normalizer"])
         if state["memory"] is not None:
             self.memory.load_state_dict(state["memory"])
         self.updates = state["updates"]
         super().load_state_dict(state)
-
-    def _see(self, observations: NDArray[np.float32]) -> None:
-        """Take over what the environments show: each observation enters the statistics once."""
-        # A copy, because environments may reuse their buffers.
-        self.observations = np.array(observations, np.float32)
-        if self.normalizer is not None:
-            self.normalizer.update(self.observations)
 
     def _play(self, tally: Tally) -> None:
         """One decision in every environment, remembered."""
@@ -283,7 +262,7 @@ class OffPolicyTrainer(Trainer):
         assert observations is not None
         masks = self.envs.action_masks() if args.mask_actions else None  # type: ignore[attr-defined]
         with torch.no_grad():
-            shown = self._normalized(observations)
+            shown = self.normalized(observations)
             actions = self.explore(shown, None if masks is None else torch.as_tensor(masks)).cpu()
         played = self.step(actions.numpy(), tally)
         ended_well = np.flatnonzero(played.completed).tolist()
@@ -299,7 +278,7 @@ class OffPolicyTrainer(Trainer):
                 last_observations=dict(zip(ended_well, played.last_observations(), strict=True)),
             )
         )
-        self._see(played.observations)
+        self.see(played.observations)
 
     def _improve(self, history: _History) -> None:
         """Learn as often as is due."""
@@ -307,27 +286,6 @@ class OffPolicyTrainer(Trainer):
         while self.updates < due and len(self.memory):
             self.updates += 1
             history.note(self.learn(self.minibatch()))
-
-    def _moved(self, values: NDArray[Any]) -> Tensor:
-        """An array on the networks' device, the same memory if that is the processor's."""
-        return torch.from_numpy(np.ascontiguousarray(values)).to(self.device)
-
-    def _normalized(self, observations: NDArray[np.float32]) -> Tensor:
-        """Observations [..., size] as networks read them; in float32, which rounds otherwise than ``normalizer``."""
-        given = self._moved(observations)
-        if self.normalizer is None:
-            return given
-        mean, factor = self._scale()
-        return ((given - mean) * factor).clamp_(-CLIP, CLIP)
-
-    def _scale(self) -> tuple[Tensor, Tensor]:
-        """Mean, and reciprocal standard deviation, of every feature so far, float32 [size]."""
-        assert self.normalizer is not None
-        if self._scaled_at != self.normalizer.count:
-            self._scaled_at = self.normalizer.count
-            factors = 1.0 / np.sqrt(self.normalizer.variance + LEAST_VARIANCE)
-            self._mean, self._factor = (self.tensor(each, torch.float32) for each in (self.normalizer.mean, factors))
-        return self._mean, self._factor
 
     def _descend(self, optimizer: torch.optim.Optimizer, loss: Tensor) -> None:
         """One step down the gradient of a loss."""

@@ -31,9 +31,9 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Any, Self
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -48,7 +48,6 @@ from rl2grid.algorithms.networks import PER_ACTION, VALUE, NetworkFactory, ortho
 from rl2grid.algorithms.playing import Tally
 from rl2grid.algorithms.sampling import drawn
 from rl2grid.algorithms.trainer import Played, Trainer
-from rl2grid.envs.normalization import NormalizeObservation
 
 # --- Hyperparameters ------------------------------------------------------------------------------------------------
 
@@ -213,6 +212,51 @@ def load_policy(state: Mapping[str, Any]) -> ActorCritic:
 # --- Rollouts -------------------------------------------------------------------------------------------------------
 
 
+class Step(NamedTuple):
+    """One decision in every environment; every array is [num_envs, ...]."""
+
+    observations: Tensor
+    masks: Tensor | None
+    actions: Tensor
+    log_probabilities: Tensor
+    rewards: NDArray[np.float64]
+    n_steps: NDArray[np.int64]
+    ended: NDArray[np.bool_]
+    completed: NDArray[np.bool_]
+    decided: NDArray[np.bool_]
+    last: Tensor | None
+    """float32 [completed, size], normalised: the last observations of episodes that were completed"""
+
+
+@dataclass(frozen=True)
+class Record:
+    """The steps of a rollout; every array is [num_steps, num_envs, ...]."""
+
+    observations: Tensor
+    """float32 [num_steps + 1, num_envs, size], normalised with the statistics of their moment; the last ones were not
+    acted on yet"""
+    masks: Tensor | None
+    actions: Tensor
+    log_probabilities: Tensor
+    rewards: NDArray[np.float64]
+    """R_k, not scaled"""
+    n_steps: NDArray[np.int64]
+    ended: Tensor
+    completed: Tensor
+    decided: Tensor
+    last: Tensor | None
+    """float32 [completed, size], normalised: the last observations of completed episodes, in order of steps"""
+
+    def values(self, value: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
+        """V(s_k) and V_{k+1}, each [num_steps, num_envs, ...], of a function [batch, size] -> [batch, ...]."""
+        flat = value(self.observations.flatten(0, 1))
+        values = flat.view(*self.observations.shape[:2], *flat.shape[1:])
+        at_ends = torch.zeros_like(values[1:])
+        if self.last is not None:
+            at_ends[self.completed] = value(self.last)
+        return values[:-1], values_that_follow(values, at_ends, self.ended)
+
+
 @dataclass(frozen=True)
 class Rollout:
     """What happened between two updates; every array is [num_steps, num_envs, ...]."""
@@ -238,15 +282,6 @@ class Rollout:
     decided: Tensor
     """bool, the action had an effect; False where the episode had ended before the agent's first decision"""
 
-    @classmethod
-    def stack(cls, steps: Sequence[Self]) -> Self:
-        """One rollout of steps, whose arrays are [num_envs, ...]."""
-        columns: dict[str, Any] = {}
-        for field in fields(cls):
-            column = [getattr(step, field.name) for step in steps]
-            columns[field.name] = None if column[0] is None else torch.stack(column)
-        return cls(**columns)
-
 
 def advantages_of_rewards(rollout: Rollout, gae_lambda: float) -> Tensor:
     """A_k of all transitions [num_steps, num_envs] (equations above)."""
@@ -269,12 +304,13 @@ def generalized_advantages(
     return advantages
 
 
-def values_that_follow(values: Tensor, last_values: Tensor, at_ends: Tensor, ended: Tensor) -> Tensor:
-    """V_{k+1} of values V(s_k), [num_steps, num_envs, ...]: those of the next step, ``at_ends`` where episodes ended.
+def values_that_follow(values: Tensor, at_ends: Tensor, ended: Tensor) -> Tensor:
+    """V_{k+1} [num_steps, num_envs, ...] of V(s_k), one step more: those of the next step, else ``at_ends``.
 
-    ``last_values`` [num_envs, ...] are those of what the last step showed.
+    The latter where episodes ended, bool [num_steps, num_envs].
     """
-    return torch.where(ended, at_ends, torch.cat([values[1:], last_values.unsqueeze(0)]))
+    shape = (*ended.shape, *(1 for _ in values.shape[2:]))
+    return torch.where(ended.view(shape), at_ends, values[1:])
 
 
 # --- Training -------------------------------------------------------------------------------------------------------
@@ -331,8 +367,6 @@ class OnPolicyTrainer(Trainer):
             UsageError: the environments cannot be learned with these hyperparameters.
         """
         super().__init__(args, envs)
-        if args.normalize_observations:
-            self.envs = NormalizeObservation(envs)
         self.network = ActorCritic(
             self.networks,
             actor_layers=args.actor_layers,
@@ -362,7 +396,7 @@ class OnPolicyTrainer(Trainer):
     def iterate(self) -> dict[str, float]:
         """Play ``num_steps`` decisions in every environment, learn from them, and return the metrics."""
         if self.observations is None:
-            self.observations = self.reset()
+            self.see(self.reset())
         rollout, metrics = self.collect()
         metrics["charts/grid_steps"] = float(self.grid_steps)
         metrics |= self.before_update()
@@ -375,41 +409,73 @@ class OnPolicyTrainer(Trainer):
     def collect(self) -> tuple[Rollout, dict[str, float]]:
         """Play one rollout."""
         tally = Tally()
-        steps = [self._play(tally)[0] for _ in range(self.args.num_steps)]
-        rollout = type(steps[0]).stack(steps)
+        steps = [self._play(tally) for _ in range(self.args.num_steps)]
         with torch.no_grad():
-            last_values = self.network.value(self.tensor(self.observations, torch.float32))
-        following = values_that_follow(rollout.values, last_values, rollout.next_values, rollout.ended)
-        return replace(rollout, next_values=following), tally.metrics()
+            return self.rollout(self._recorded(steps)), tally.metrics()
 
-    def _play(self, tally: Tally) -> tuple[Rollout, Played]:
-        """One decision in every environment: a step of a rollout, its ``next_values`` known where episodes ended."""
-        args, network = self.args, self.network
-        observations = self.tensor(self.observations, torch.float32)
-        masks = self.tensor(self.envs.action_masks()) if args.mask_actions else None  # type: ignore[attr-defined]
+    def note(self, played: Played) -> None:
+        """What is to be kept of a step beside what all algorithms need, before the environments go on."""
+        return
+
+    def rollout(self, record: Record) -> Rollout:
+        """What an update needs to know of the steps of a rollout."""
+        values, next_values = record.values(self.network.value)
+        return Rollout(
+            record.observations[:-1],
+            record.masks,
+            record.actions,
+            record.log_probabilities,
+            rewards=self.tensor(record.rewards * self.reward_scale, torch.float32),
+            discounts=self.tensor(self.args.gamma**record.n_steps, torch.float32),
+            values=values,
+            next_values=next_values,
+            ended=record.ended,
+            decided=record.decided,
+        )
+
+    def _play(self, tally: Tally) -> Step:
+        """One decision in every environment."""
+        assert self.observations is not None
+        observations = self.normalized(self.observations)
+        masks = self.tensor(self.envs.action_masks()) if self.args.mask_actions else None  # type: ignore[attr-defined]
         with torch.no_grad():
-            actions, log_probabilities = network.sample(observations, masks, self.generator)
-            values = network.value(observations)
+            actions, log_probabilities = self.network.sample(observations, masks, self.generator)
         played = self.step(self._playable(actions), tally)
-        self.observations = played.observations
-        at_ends = torch.zeros(args.num_envs, device=self.device)
+        self.see(played.observations)
+        self.note(played)
+        last = None
         if played.completed.any():
-            with torch.no_grad():
-                last = self.tensor(np.stack(played.last_observations()), torch.float32)
-                at_ends[self.tensor(played.completed)] = network.value(last)
-        step = Rollout(
+            last = self.normalized(np.stack(played.last_observations()).astype(np.float32))
+        return Step(
             observations,
             masks,
             actions,
             log_probabilities,
-            rewards=self.tensor(played.rewards * self.reward_scale, torch.float32),
-            discounts=self.tensor(args.gamma**played.n_steps, torch.float32),
-            values=values,
-            next_values=at_ends,
-            ended=self.tensor(played.ended),
-            decided=self.tensor(played.decided),
+            played.rewards,
+            played.n_steps,
+            played.ended,
+            played.completed,
+            played.decided,
+            last,
         )
-        return step, played
+
+    def _recorded(self, steps: Sequence[Step]) -> Record:
+        """The steps of a rollout, and what the last one showed."""
+        assert self.observations is not None
+        masks = [step.masks for step in steps if step.masks is not None]
+        last = [step.last for step in steps if step.last is not None]
+        return Record(
+            torch.stack([*(step.observations for step in steps), self.normalized(self.observations)]),
+            torch.stack(masks) if masks else None,
+            torch.stack([step.actions for step in steps]),
+            torch.stack([step.log_probabilities for step in steps]),
+            np.stack([step.rewards for step in steps]),
+            np.stack([step.n_steps for step in steps]),
+            self.moved(np.stack([step.ended for step in steps])),
+            self.moved(np.stack([step.completed for step in steps])),
+            self.moved(np.stack([step.decided for step in steps])),
+            torch.cat(last) if last else None,
+        )
 
     def improve(self, data: Minibatch, decided: Tensor) -> tuple[list[Any], int]:
         """Descend on minibatches of the transitions that a decision began, epoch after epoch.
@@ -453,10 +519,6 @@ class OnPolicyTrainer(Trainer):
         """See :class:`Trainer`."""
         layers = {"actor_layers": list(self.args.actor_layers), "critic_layers": list(self.args.critic_layers)}
         return self.network, {**layers, "n_costs": len(self.network.cost_critics)}
-
-    def normalizer_state(self) -> dict[str, Any] | None:
-        """See :class:`Trainer`."""
-        return self.envs.normalizer.state_dict() if isinstance(self.envs, NormalizeObservation) else None
 
     def _playable(self, actions: Tensor) -> NDArray[Any]:
         """What the environments are given: ids, or the actions clipped into their box."""

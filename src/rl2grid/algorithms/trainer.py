@@ -40,8 +40,12 @@ from rl2grid.algorithms.playing import (
     reported,
     resume_environments,
 )
+from rl2grid.envs.normalization import CLIP, ObservationNormalizer
 from rl2grid.envs.spec import spec_of
 from rl2grid.errors import UsageError
+
+LEAST_VARIANCE = 1e-8
+"""Added to the variance of every feature before it is divided by, as :class:`ObservationNormalizer` does."""
 
 
 class Played(NamedTuple):
@@ -99,6 +103,8 @@ class Trainer(ABC):
                 "normalize_observations to False."
             )
         self.networks = NetworkFactory(self.spec, args.network, self.generator)
+        self.normalizer = ObservationNormalizer(self.observation_size) if args.normalize_observations else None
+        self._scale_of = -1
         self.reward_scale = 1.0 - args.gamma if args.reward_scale is None else args.reward_scale
 
         self.num_iterations = args.total_timesteps // (args.num_envs * args.num_steps)
@@ -108,6 +114,7 @@ class Trainer(ABC):
         self.grid_steps = 0
         """Grid steps behind them."""
         self.observations: NDArray[np.float32] | None = None
+        """What the environments show, as they give it."""
         self._over = np.zeros(args.num_envs, np.bool_)
         self._episode_return = np.zeros(args.num_envs, np.float64)
         self._episode_length = np.zeros(args.num_envs, np.int64)
@@ -135,7 +142,7 @@ class Trainer(ABC):
 
     def normalizer_state(self) -> dict[str, Any] | None:
         """The statistics that scale observations; None without normalisation."""
-        return None
+        return None if self.normalizer is None else self.normalizer.state_dict()
 
     def policy_state(self) -> dict[str, Any]:
         """All that is needed to act: see ``load_policy``; ``normalizer`` is None without normalisation."""
@@ -152,6 +159,7 @@ class Trainer(ABC):
         """All that is needed to go on, after an iteration."""
         return {
             **{name: part.state_dict() for name, part in self.learned().items()},
+            "normalizer": self.normalizer_state(),
             "generator": self.generator.get_state(),
             "iteration": self.iteration,
             "decisions": self.decisions,
@@ -171,6 +179,9 @@ class Trainer(ABC):
         """
         for name, part in self.learned().items():
             part.load_state_dict(state[name])
+        if self.normalizer is not None:
+            self.normalizer.load_state_dict(state["normalizer"])
+            self._scale_of = -1
         self.generator.set_state(state["generator"])
         self.iteration, self.decisions = state["iteration"], state["decisions"]
         self.grid_steps = state["grid_steps"]
@@ -224,6 +235,33 @@ class Trainer(ABC):
         self._episode_return[begun] = reported(infos, "reset_reward", nothing)[begun]
         self._episode_length[begun] = 0
 
+    def see(self, observations: NDArray[np.float32]) -> None:
+        """Take over what the environments show: each observation enters the statistics once."""
+        # A copy, because environments may reuse their buffers.
+        self.observations = np.array(observations, np.float32)
+        if self.normalizer is not None:
+            self.normalizer.update(self.observations)
+
     def tensor(self, values: Any, dtype: torch.dtype | None = None) -> Tensor:
         """A copy of an array on the networks' device."""
         return torch.tensor(values, dtype=dtype, device=self.device)
+
+    def moved(self, values: NDArray[Any]) -> Tensor:
+        """An array on the networks' device, the same memory if that is the processor's."""
+        return torch.from_numpy(np.ascontiguousarray(values)).to(self.device)
+
+    def normalized(self, observations: NDArray[np.float32]) -> Tensor:
+        """Observations [..., size] as networks read them, by the statistics of this moment.
+
+        In float32, and therefore rounded otherwise than by :meth:`ObservationNormalizer.normalize`; a tensor of its own
+        unless observations are not scaled.
+        """
+        given = self.moved(observations)
+        if self.normalizer is None:
+            return given
+        if self._scale_of != self.normalizer.count:
+            self._scale_of = self.normalizer.count
+            self._mean = self.tensor(self.normalizer.mean, torch.float32)
+            deviation = np.sqrt(self.normalizer.variance + LEAST_VARIANCE)
+            self._factor = self.tensor(1.0 / deviation, torch.float32)
+        return ((given - self._mean) * self._factor).clamp_(-CLIP, CLIP)
