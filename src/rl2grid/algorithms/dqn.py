@@ -102,12 +102,14 @@ def default(*, continuous: bool) -> Args:
     Many random actions do nothing: at random, one of the first few actions would already cut the grid apart, and
     little would be seen of what comes later. With one network the values grow beyond any return that is possible, as
     the best of many values is easily one that is too high and the next target is built on it; the least value of
-    four does not, and what is tried is then worth trying, so that few random actions are needed.
+    four does not, and what is tried is then worth trying, so that few random actions are needed. Few steps down the
+    gradient, and large ones (see SAC's).
     """
     _refuse_continuous(continuous)
     return Args(
         num_envs=32,
-        learning_rate=1e-3,
+        train_frequency=32,
+        learning_rate=3e-3,
         target_frequency=1_000,
         first_epsilon=0.2,
         last_epsilon=0.02,

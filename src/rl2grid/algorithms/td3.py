@@ -81,9 +81,11 @@ class Args(OffPolicyArgs):
 
 
 def default(*, continuous: bool) -> Args:
-    """Our own values, for tasks with a heuristic on a small machine."""
+    """Our own values, for tasks with a heuristic on a small machine: few steps down the gradient, and large ones (see
+    SAC's).
+    """
     _refuse_discrete(continuous)
-    return Args(gamma=0.99)
+    return Args(gamma=0.99, train_frequency=32, actor_learning_rate=1e-3, critic_learning_rate=3e-3, tau=0.03)
 
 
 def paper(*, continuous: bool) -> Args:
