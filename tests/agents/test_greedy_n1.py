@@ -37,7 +37,7 @@ def test_n_1_after_doing_nothing_is_what_switching_each_line_would_do():
 
 def test_n_1_after_an_action_is_that_of_the_grid_once_it_was_played():
     env = gymnasium.make("rl2grid/bus14-T1-v0", disable_env_checker=True)
-    env.reset(seed=6, options={"start": 10})
+    env.reset(seed=1, options={"start": 10})
     base = env.unwrapped
     moves = np.flatnonzero(level_catalogue(base.grid, 1).kind == ActionKind.MOVE)
     move = int(moves[base.what_if(moves.tolist()).worst_loading.argmin()])
