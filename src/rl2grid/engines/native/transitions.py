@@ -299,7 +299,7 @@ class NativeTransitions(Transitions):
         slices = [slice(first, last) for first, last in itertools.pairwise(bounds)]
         for thread in range(parts):  # made here: threads must not make room at the same time
             self._addresses(thread)
-        list(self._threads.map(play, range(parts), slices))
+        self._threads.map(play, range(parts), slices)
 
     def _addresses(self, thread: int) -> tuple[int, int]:
         """The environments, and where the careful heuristic may try things, for one thread."""

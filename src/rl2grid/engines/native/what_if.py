@@ -168,7 +168,7 @@ class WhatIf:
         if len(parts) == 1:
             solve_part(0)
         else:
-            list(self._threads.map(solve_part, range(len(parts))))
+            self._threads.map(solve_part, range(len(parts)))
         return outcomes
 
     def _parts(self, order: I32) -> list[I32]:
