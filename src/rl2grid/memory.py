@@ -1,4 +1,4 @@
-"""Numbers read where they lie: compiled code knows the address of a series, whoever has mapped it into memory."""
+"""Numbers in memory that compiled code shares: read where somebody has mapped them, or counted by several threads."""
 
 from __future__ import annotations
 
@@ -29,3 +29,14 @@ def int16_at(typing_context: Any, address: Any, index: Any) -> Any:
         return builder.load(builder.gep(pointer, [arguments[1]]))
 
     return types.int16(types.int64, types.int64), generate
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def take_next(typing_context: Any, counter: Any) -> Any:
+    """The number at the address ``counter``, int64, which is one more afterwards: no two threads are given the same."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        word = ir.IntType(64)
+        return builder.atomic_rmw("add", builder.inttoptr(arguments[0], word.as_pointer()), word(1), "monotonic")
+
+    return types.int64(types.int64), generate

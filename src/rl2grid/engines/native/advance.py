@@ -31,6 +31,7 @@ from rl2grid.mdp.heuristics import (
 from rl2grid.mdp.observations import write_redispatch_observation, write_topology_observation
 from rl2grid.mdp.rewards import default_components, paper_components, released_components
 from rl2grid.mdp.state import GridState
+from rl2grid.memory import take_next
 
 ALONE, IDLE, RECOVERY, RECONNECT, CAREFUL, CAREFUL_RECONNECT = range(6)
 """Who plays between two decisions: nobody, or a heuristic (recovery and careful only reconnect on continuous tasks)."""
@@ -48,6 +49,7 @@ def advance(
     address: int,
     simulated: int,
     rows: NDArray[np.int64],
+    counter: NDArray[np.int64],
     begins: bool,
     first: NDArray[np.int64],
     kinds: NDArray[np.int64],
@@ -60,12 +62,13 @@ def advance(
     weights: Components,
     gamma: float,
 ) -> None:
-    """Play one transition in each of ``rows``.
+    """Play one transition in each of ``rows``, or in those of them that no other thread has taken.
 
     Args:
         address: of the handle to the :class:`~rl2grid.engines.native.environments.Environments`.
         simulated: address of a handle to one environment, in which the careful heuristic tries things.
         rows: environments, int64 [k].
+        counter: int64 [1], how many of ``rows`` were taken so far, by all threads that play them together.
         begins: the first rows of episodes are shown; nobody acts.
         first: where the changes of each agent's action begin, and where the last one's end, int64 [k + 1].
         kinds: what each change does, an :class:`~rl2grid.mdp.actions.ActionKind`, int64 [change].
@@ -80,7 +83,11 @@ def advance(
     """
     environments = open_environments(address)
     state, orders = environments.state, environments.orders
-    for k in range(rows.shape[0]):
+    while True:
+        # Heuristics play some rows a hundred times as long as others: who is free takes the next.
+        k: int = take_next(np.int64(counter.ctypes.data))  # type: ignore[call-arg]
+        if k >= rows.shape[0]:
+            break
         i = rows[k]
         illegal, ambiguous = False, False
         if begins:

@@ -215,7 +215,7 @@ class NativeTransitions(Transitions):
         if not self.is_compiled:
             super().play(i, action)
             return
-        self._advance_part(0, self._rows[i : i + 1], commands_of(self.engine.grid, [action]), False)
+        self._advance(self._rows[i : i + 1], commands_of(self.engine.grid, [action]), 1, False)
         notes = self.engine.environments.notes
         self.action_effects[i] = _in_words(self.engine.grid, notes, i, action) if notes.worth_a_word[i] else ""
 
@@ -284,10 +284,12 @@ class NativeTransitions(Transitions):
         return effects
 
     def _advance(self, rows: I64, commands: Commands, num_threads: int, begins: bool) -> None:
-        def advance_slice(thread: int, part: slice) -> None:
-            self._advance_part(thread, rows[part], commands[part], begins)
+        counter = np.zeros(1, np.int64)
 
-        self._in_threads(advance_slice, len(rows), num_threads)
+        def advance_some(thread: int, _: slice) -> None:
+            self._advance_some(thread, rows, counter, commands, begins)
+
+        self._in_threads(advance_some, len(rows), num_threads)
 
     def _in_threads(self, play: Callable[[int, slice], None], n_rows: int, num_threads: int) -> None:
         """Call ``play`` with the number of a thread and a part of ``n_rows`` rows, in as many threads as pay off."""
@@ -307,11 +309,12 @@ class NativeTransitions(Transitions):
         # No other heuristic looks there.
         return address, self.engine.trial_address_for(thread) if self.heuristic == "careful" else address
 
-    def _advance_part(self, thread: int, rows: I64, commands: Commands, begins: bool) -> None:
+    def _advance_some(self, thread: int, rows: I64, counter: I64, commands: Commands, begins: bool) -> None:
         weights = self.reward.weights
         advance(
             *self._addresses(thread),
             rows,
+            counter,
             begins,
             commands.first,
             commands.kinds,
