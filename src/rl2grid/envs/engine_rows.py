@@ -8,7 +8,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from rl2grid.arrays import I64, Flags
+from rl2grid.arrays import I64
 from rl2grid.engines.worlds import World, world_of_plain
 from rl2grid.envs.description import check_action
 from rl2grid.envs.info import COSTS, GAME_OVER_WORDS
@@ -23,14 +23,13 @@ from rl2grid.handles import Handle
 from rl2grid.mdp import reports
 from rl2grid.mdp.action_masks import write_action_masks
 from rl2grid.mdp.features import observation_size
-from rl2grid.mdp.reports import blank_report, write_report
+from rl2grid.mdp.reports import Report, blank_report, write_report
 from rl2grid.scenarios.episodes import EpisodePlan
 
 Decisions = TypeVar("Decisions")
 """Checked actions of all rows, in the form in which the engine takes them."""
 
 _WORDS = ("scenario", "game_over_text", "action_effect")
-_NO_WORDS = np.array(None, object)
 
 
 class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
@@ -52,6 +51,7 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
         self._redraws = self._episodes[reports.START_REDRAWS]
         self._earlier_steps = self._episodes[reports.EARLIER_STEPS]
         self._shown_effects = np.full(n, "", object)
+        self._nothing = np.full(n, None, object)
         self._cost = -1 if self.constraint is None else COSTS.index(self.constraint)
         self._form = InfoForm([*_WORDS, *(["action_set_hash"] if self._hashes else [])], options.gamma is not None)
         self._all_begun = False  # every row was reset or restored once
@@ -64,8 +64,8 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
     def step(self, actions: Any) -> Batch:
         """See :meth:`rl2grid.envs.rows.Rows.step`."""
         decisions = self._decided(actions)
-        waiting = np.flatnonzero(self._pending)  # these rows return the ending that their reset has already played
-        rows = np.flatnonzero(~self._pending) if len(waiting) else self._rows
+        (waiting,) = self._pending.nonzero()  # these rows return the ending that their reset has already played
+        rows = np.delete(self._rows, waiting) if len(waiting) else self._rows
         self._pending[waiting] = False
         self._note_decisions()
         self._play(rows, decisions)
@@ -74,13 +74,12 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
         effects[waiting] = ""
         state = self.state
         rewards, terminated, truncated = state.transition_reward.copy(), state.terminated.copy(), state.truncated.copy()
-        ended = terminated | truncated
-        if not ended.any():
+        (ended,) = (terminated | truncated).nonzero()
+        if not len(ended):
             return self._batch(effects, rewards, terminated, truncated)
         endings = self._endings(ended, effects)
-        begun = np.flatnonzero(ended)
-        self._begin(begun, [None] * len(begun), None)
-        effects[begun] = ""
+        self._begin(ended, [None] * len(ended), None)
+        effects[ended] = ""
         batch = self._batch(effects, rewards, terminated, truncated)
         batch.infos |= endings
         return batch
@@ -115,6 +114,8 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
     def restore(self, i: int, world: World) -> None:
         """Bring row ``i`` to where ``world`` was saved; see :meth:`TaskEnvironments.restore`."""
         super().restore(i, world)
+        # A copy: the array was handed out with the infos of the last step.
+        self._shown_effects = self._shown_effects.copy()
         self._shown_effects[i] = self.transitions.action_effects[i]
 
     def ask(self, name: str, arguments: tuple[Any, ...], keywords: dict[str, Any]) -> list[Any]:
@@ -201,23 +202,29 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
             self._state_handle = Handle(self.state)
         return self._state_handle.address
 
-    def _endings(self, ended: Flags, effects: NDArray[np.object_]) -> dict[str, Any]:
-        """Infos of the episodes that have ``ended``, bool [n]: their last observations and infos, masked."""
-        rows = np.flatnonzero(ended)
-        observations = np.full(self._n, None, object)
+    def _endings(self, rows: I64, effects: NDArray[np.object_]) -> dict[str, Any]:
+        """Infos of ``rows``, whose episodes have ended: their last observations and infos, masked."""
+        told = np.zeros(self._n, np.bool_)
+        told[rows] = True
+        observations = self._nothing.copy()
         for i, observation in zip(rows.tolist(), self._last_observations(rows), strict=True):
             observations[i] = observation
-        last = self._infos(rows, effects, ended)
-        return {"final_obs": observations, "_final_obs": ended, "final_info": last, "_final_info": ended}
+        words = []
+        for given in self._words(effects):
+            words.append(self._nothing.copy())
+            words[-1][rows] = given[rows]
+        last = self._form.named(words, self._report(rows), told)
+        return {"final_obs": observations, "_final_obs": told, "final_info": last, "_final_info": told}
 
-    def _infos(self, rows: I64, effects: NDArray[np.object_], told: Flags) -> dict[str, Any]:
-        """Infos of ``rows``; those of others are blank. ``told`` is their mask, bool [n]."""
+    def _words(self, effects: NDArray[np.object_]) -> tuple[NDArray[np.object_], ...]:
+        """Texts of all rows in the order of the form, object [n] each, and what ``str`` makes texts of."""
+        return self._scenarios, GAME_OVER_WORDS[self.state.game_over], effects, *self._hashes
+
+    def _report(self, rows: I64) -> Report:
+        """Report of ``rows``; the columns of others are blank."""
         report = blank_report(self._n, self.grid.n_line)
         write_report(self._state_address, rows, self._cost, self._episodes, self._pending, *report)
-        words = np.array((self._scenarios, GAME_OVER_WORDS[self.state.game_over], effects, *self._hashes), object)
-        if len(rows) < self._n:
-            words = np.where(told, words, _NO_WORDS)
-        return self._form.named(words, report, told)
+        return report
 
     def _standing_batch(self, effects: NDArray[np.object_]) -> Batch:
         """Where all rows stand, no step having been played."""
@@ -231,5 +238,7 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
         truncated: NDArray[np.bool_],
     ) -> Batch:
         self._shown_effects = effects
-        infos = self._infos(self._rows, effects, np.ones(self._n, np.bool_))
+        scenarios, reasons, _, *hashes = self._words(effects)
+        words = (scenarios.copy(), reasons, effects, *(each.copy() for each in hashes))
+        infos = self._form.named(words, self._report(self._rows), np.ones(self._n, np.bool_))
         return Batch(self._observations(), rewards, terminated, truncated, infos)

@@ -17,39 +17,40 @@ from rl2grid.mdp.scores import SCORES
 Words = NDArray[np.object_]
 
 _COUNTS = {
-    "start": reports.START,
-    "start_redraws": reports.START_REDRAWS,
-    "step": reports.STEP,
-    "episode_length": reports.EPISODE_LENGTH,
-    "decisions": reports.DECISIONS,
-    "n_steps": reports.N_STEPS,
-    "grid_steps": reports.GRID_STEPS,
-    "reset_steps": reports.RESET_STEPS,
-    "game_over": reports.GAME_OVER,
+    reports.START: "start",
+    reports.START_REDRAWS: "start_redraws",
+    reports.GRID_STEPS: "grid_steps",
+    reports.STEP: "step",
+    reports.EPISODE_LENGTH: "episode_length",
+    reports.DECISIONS: "decisions",
+    reports.N_STEPS: "n_steps",
+    reports.RESET_STEPS: "reset_steps",
+    reports.GAME_OVER: "game_over",
 }
-_FLAGS = {"illegal": reports.ILLEGAL, "ambiguous": reports.AMBIGUOUS, "over": reports.OVER}
+_FLAGS = {reports.ILLEGAL: "illegal", reports.AMBIGUOUS: "ambiguous", reports.OVER: "over"}
 _NUMBERS = {
-    "survival": reports.SURVIVAL,
-    "cost": reports.COST,
-    "reset_reward": reports.RESET_REWARD,
-    "episode_return": reports.EPISODE_RETURN,
+    reports.SURVIVAL: "survival",
+    reports.COST: "cost",
+    reports.RESET_REWARD: "reset_reward",
+    reports.EPISODE_RETURN: "episode_return",
+    reports.DISCOUNTED_REWARD: "discounted_reward",
 }
 _DICTS = {
-    "reward_components": (COMPONENTS, reports.REWARD_COMPONENTS),
-    "costs": (COSTS, reports.TRANSITION_COSTS),
-    "reset_components": (COMPONENTS, reports.RESET_COMPONENTS),
-    "reset_costs": (COSTS, reports.RESET_COSTS),
-    "episode_components": (COMPONENTS, reports.EPISODE_COMPONENTS),
-    "episode_costs": (COSTS, reports.EPISODE_COSTS),
-    "scores": (SCORES, reports.EPISODE_SCORES),
+    reports.REWARD_COMPONENTS: ("reward_components", COMPONENTS),
+    reports.TRANSITION_COSTS: ("costs", COSTS),
+    reports.RESET_COMPONENTS: ("reset_components", COMPONENTS),
+    reports.RESET_COSTS: ("reset_costs", COSTS),
+    reports.EPISODE_COMPONENTS: ("episode_components", COMPONENTS),
+    reports.EPISODE_COSTS: ("episode_costs", COSTS),
+    reports.EPISODE_SCORES: ("scores", SCORES),
 }
-"""Names of the entries, and the line of the first."""
+"""By the line of the first entry: the key, and the names of the entries."""
 
 
 class InfoForm:
     """Which keys infos have, and where their values are.
 
-    Every step names dozens of arrays: the names of masks and the places are looked up once.
+    Every step names dozens of arrays: names and places are put in order once.
 
     Args:
         words: keys of texts and of what ``str`` makes texts of.
@@ -57,36 +58,31 @@ class InfoForm:
     """
 
     def __init__(self, words: Sequence[str], tells_discounted: bool) -> None:
-        numbers = _NUMBERS | ({"discounted_reward": reports.DISCOUNTED_REWARD} if tells_discounted else {})
-        places = ({key: line for line, key in enumerate(words)}, _COUNTS, _FLAGS, numbers)
-        self._lines = [
-            (key, _mask_of(key), block, line) for block, lines in enumerate(places) for key, line in lines.items()
-        ]
+        names = [_COUNTS, _FLAGS, _NUMBERS]
+        self._keys = [*words, *(lines[line] for lines in names for line in range(len(lines))), "attacked_lines"]
         self._dicts = [
-            (key, _mask_of(key), [(name, _mask_of(name), first + k) for k, name in enumerate(names)])
-            for key, (names, first) in _DICTS.items()
+            (key, slice(first, first + len(entries)), entries, [_mask_of(entry) for entry in entries])
+            for first, (key, entries) in _DICTS.items()
         ]
+        self._masks = [_mask_of(key) for key in (*self._keys, *(key for key, *_ in self._dicts))]
+        self._tells_discounted = tells_discounted
 
-    def named(self, words: Words, report: Report, told: Flags) -> dict[str, Any]:
+    def named(self, words: Sequence[Words], report: Report, told: Flags) -> dict[str, Any]:
         """Infos by key of :data:`rl2grid.envs.info.INFO_KEYS`, arrays [n] or dicts of such, each beside its mask.
 
         Args:
-            words: object [key, n].
+            words: object [n] for each key.
             report: the numbers.
             told: the mask of every key, bool [n]: the environments that have infos.
         """
-        numbers = report.numbers
-        blocks = (words, report.counts, report.flags, numbers)
-        infos: dict[str, Any] = {"attacked_lines": report.attacked, "_attacked_lines": told}
-        for key, mask, block, line in self._lines:
-            infos[key] = blocks[block][line]
-            infos[mask] = told
-        for key, mask, entries in self._dicts:
-            infos[key] = values = {}
-            infos[mask] = told
-            for name, mask_of_name, line in entries:
-                values[name] = numbers[line]
-                values[mask_of_name] = told
+        numbers = list(report.numbers)
+        values = (*words, *report.counts, *report.flags, *numbers[: len(_NUMBERS)], report.attacked)
+        infos: dict[str, Any] = dict(zip(self._keys, values, strict=True))
+        for key, lines, entries, masks in self._dicts:
+            infos[key] = dict(zip(entries, numbers[lines], strict=True)) | dict.fromkeys(masks, told)
+        infos |= dict.fromkeys(self._masks, told)
+        if not self._tells_discounted:
+            del infos["discounted_reward"], infos["_discounted_reward"]
         return infos
 
 

@@ -99,7 +99,7 @@ class NativeRows(EngineRows[Commands]):
     def _discrete(self, actions: Any) -> Commands:
         assert self._catalogue is not None
         numbers = np.asarray(actions)
-        valid = numbers.shape == (self._n,) and np.issubdtype(numbers.dtype, np.integer)
+        valid = numbers.shape == (self._n,) and numbers.dtype.kind in "iu"
         if not valid or numbers.min() < 0 or numbers.max() >= len(self._catalogue):
             self._check(actions)
         return Commands(

@@ -87,6 +87,8 @@ class Commands:
 
     def __getitem__(self, part: slice) -> Commands:
         start, stop, _ = part.indices(len(self))
+        if stop - start == len(self):
+            return self
         return replace(self, first=self.first[start : stop + 1], injects=self.injects[part], values=self.values[part])
 
     def take(self, rows: I64) -> Commands:
@@ -193,6 +195,7 @@ class NativeTransitions(Transitions):
         self._reward_code = _COMPILED_IN.get(self.reward.components)
         self._threads = Threads(os.cpu_count() or 1, "rl2grid")
         self._rows = np.arange(n)
+        self._no_effects = np.full(n, "", object)
         self._nothing = commands_of(self.engine.grid, [DO_NOTHING] * n)
 
     @property
@@ -274,9 +277,9 @@ class NativeTransitions(Transitions):
         """What became of the actions of all environments, object [n]: an empty text, or what ``str`` makes one of."""
         if not self.is_compiled:
             return np.array([self.action_effects[i] for i in range(len(commands))], object)
-        effects = np.full(len(commands), "", object)
+        effects = self._no_effects.copy()
         notes = self.engine.environments.notes
-        rows = np.flatnonzero(notes.worth_a_word)
+        (rows,) = notes.worth_a_word.nonzero()
         if len(rows):
             noted = NotedActions(self.engine.grid, commands, rows, notes_of(notes, rows))
             for k, i in enumerate(rows.tolist()):
