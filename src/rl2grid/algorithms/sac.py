@@ -114,19 +114,20 @@ def default(*, continuous: bool) -> Args:
     On topology tasks the untrained policy mostly does nothing and plays from the beginning: at random, one of the
     first few actions would already cut the grid apart, and little would be seen of what comes later.
 
-    Few steps down the gradient, and large ones: as much is learned from a decision as with one in four and a third of
-    the step sizes, in an eighth of the time (``benchmarks/equal_learning.py``).
+    There, few steps down the gradient, and large ones, learn as much from a decision as one in four with a third of the
+    step sizes, in an eighth of the time; on redispatching tasks they learn less (``benchmarks/equal_learning.py``).
     """
-    steps: dict[str, Any] = {
-        "train_frequency": 32,
-        "actor_learning_rate": 1e-3,
-        "critic_learning_rate": 3e-3,
-        "temperature_learning_rate": 5e-3,
-        "tau": 0.03,
-    }
     if continuous:
-        return Args(gamma=0.99, mask_actions=False, **steps)
-    return Args(random_start=False, initial_do_nothing=0.6, **steps)
+        return Args(gamma=0.99, mask_actions=False)
+    return Args(
+        random_start=False,
+        initial_do_nothing=0.6,
+        train_frequency=32,
+        actor_learning_rate=1e-3,
+        critic_learning_rate=3e-3,
+        temperature_learning_rate=5e-3,
+        tau=0.03,
+    )
 
 
 def paper(*, continuous: bool) -> Args:
