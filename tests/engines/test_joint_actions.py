@@ -158,7 +158,8 @@ def same(one, other):
 
 def test_batches_keep_every_action():
     commands = commands_of(BUS14, ACTIONS)
-    assert commands.first.tolist() == [0, 0, 2, 2, 3, 5]
+    assert commands.first.tolist() == [0, 0, 2, 2, 3]
+    assert commands.end.tolist() == [0, 2, 2, 3, 5]
     for k, action in enumerate(ACTIONS):
         same(commands.action(k), action)
     for chosen in ([0, 1, 2, 3, 4], [4, 1], [3], [2, 0]):
@@ -272,5 +273,5 @@ def test_the_catalogue_is_played_as_before():
     catalogue = full_catalogue(BUS14)
     actions = [catalogue[k] for k in range(0, len(catalogue), 13)]
     commands = commands_of(BUS14, actions)
-    np.testing.assert_array_equal(np.diff(commands.first), [len(action.changes) for action in actions])
+    np.testing.assert_array_equal(commands.end - commands.first, [len(action.changes) for action in actions])
     np.testing.assert_array_equal(commands.masks[:, 0], catalogue.mask[13::13, 0])

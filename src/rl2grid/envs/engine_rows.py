@@ -23,7 +23,7 @@ from rl2grid.handles import Handle
 from rl2grid.mdp import reports
 from rl2grid.mdp.action_masks import write_action_masks
 from rl2grid.mdp.features import observation_size
-from rl2grid.mdp.reports import Report, blank_report, write_report
+from rl2grid.mdp.reports import Report, blank_report, write_outcomes, write_report
 from rl2grid.scenarios.episodes import EpisodePlan
 
 Decisions = TypeVar("Decisions")
@@ -66,17 +66,17 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
         decisions = self._decided(actions)
         (waiting,) = self._pending.nonzero()  # these rows return the ending that their reset has already played
         rows = np.delete(self._rows, waiting) if len(waiting) else self._rows
-        self._pending[waiting] = False
+        self._pending[:] = False
         self._note_decisions()
         self._play(rows, decisions)
         self._note_reached()
         effects = self._effects(decisions)
-        effects[waiting] = ""
-        state = self.state
-        rewards, terminated, truncated = state.transition_reward.copy(), state.terminated.copy(), state.truncated.copy()
-        (ended,) = (terminated | truncated).nonzero()
-        if not len(ended):
+        if len(waiting):
+            effects[waiting] = ""
+        rewards, terminated, truncated = np.empty(self._n), np.empty(self._n, np.bool_), np.empty(self._n, np.bool_)
+        if not write_outcomes(self._state_address, rewards, terminated, truncated):
             return self._batch(effects, rewards, terminated, truncated)
+        (ended,) = (terminated | truncated).nonzero()
         endings = self._endings(ended, effects)
         self._begin(ended, [None] * len(ended), None)
         effects[ended] = ""
@@ -209,16 +209,14 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
         observations = self._nothing.copy()
         for i, observation in zip(rows.tolist(), self._last_observations(rows), strict=True):
             observations[i] = observation
+        report = self._report(rows)
+        reasons = GAME_OVER_WORDS.take(report.counts[reports.GAME_OVER])
         words = []
-        for given in self._words(effects):
+        for given in (self._scenarios, reasons, effects, *self._hashes):
             words.append(self._nothing.copy())
             words[-1][rows] = given[rows]
-        last = self._form.named(words, self._report(rows), told)
+        last = self._form.named(words, report, told)
         return {"final_obs": observations, "_final_obs": told, "final_info": last, "_final_info": told}
-
-    def _words(self, effects: NDArray[np.object_]) -> tuple[NDArray[np.object_], ...]:
-        """Texts of all rows in the order of the form, object [n] each, and what ``str`` makes texts of."""
-        return self._scenarios, GAME_OVER_WORDS[self.state.game_over], effects, *self._hashes
 
     def _report(self, rows: I64) -> Report:
         """Report of ``rows``; the columns of others are blank."""
@@ -238,7 +236,8 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
         truncated: NDArray[np.bool_],
     ) -> Batch:
         self._shown_effects = effects
-        scenarios, reasons, _, *hashes = self._words(effects)
-        words = (scenarios.copy(), reasons, effects, *(each.copy() for each in hashes))
-        infos = self._form.named(words, self._report(self._rows), np.ones(self._n, np.bool_))
+        report = self._report(self._rows)
+        reasons = GAME_OVER_WORDS.take(report.counts[reports.GAME_OVER])
+        words = (self._scenarios.copy(), reasons, effects, *(each.copy() for each in self._hashes))
+        infos = self._form.named(words, report, np.ones(self._n, np.bool_))
         return Batch(self._observations(), rewards, terminated, truncated, infos)

@@ -61,10 +61,10 @@ class InfoForm:
         names = [_COUNTS, _FLAGS, _NUMBERS]
         self._keys = [*words, *(lines[line] for lines in names for line in range(len(lines))), "attacked_lines"]
         self._dicts = [
-            (key, slice(first, first + len(entries)), entries, [_mask_of(entry) for entry in entries])
+            (key, slice(first, first + len(entries)), entries, _beside_masks(entries))
             for first, (key, entries) in _DICTS.items()
         ]
-        self._masks = [_mask_of(key) for key in (*self._keys, *(key for key, *_ in self._dicts))]
+        self._all = _beside_masks((*self._keys, *(key for key, *_ in self._dicts)))
         self._tells_discounted = tells_discounted
 
     def named(self, words: Sequence[Words], report: Report, told: Flags) -> dict[str, Any]:
@@ -77,14 +77,16 @@ class InfoForm:
         """
         numbers = list(report.numbers)
         values = (*words, *report.counts, *report.flags, *numbers[: len(_NUMBERS)], report.attacked)
-        infos: dict[str, Any] = dict(zip(self._keys, values, strict=True))
-        for key, lines, entries, masks in self._dicts:
-            infos[key] = dict(zip(entries, numbers[lines], strict=True)) | dict.fromkeys(masks, told)
-        infos |= dict.fromkeys(self._masks, told)
+        infos: dict[str, Any] = dict.fromkeys(self._all, told)
+        infos.update(zip(self._keys, values, strict=True))
+        for key, lines, entries, names in self._dicts:
+            infos[key] = entries_of = dict.fromkeys(names, told)
+            entries_of.update(zip(entries, numbers[lines], strict=True))
         if not self._tells_discounted:
             del infos["discounted_reward"], infos["_discounted_reward"]
         return infos
 
 
-def _mask_of(key: str) -> str:
-    return f"_{key}"
+def _beside_masks(keys: Sequence[str]) -> list[str]:
+    """Keys, each before that of its mask."""
+    return [name for key in keys for name in (key, f"_{key}")]

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rl2grid.arrays import I64
+from rl2grid.engines.native.orders import refer_to_choices
 from rl2grid.engines.native.transitions import Commands, NativeTransitions, commands_of
 from rl2grid.envs.engine_rows import EngineRows
 from rl2grid.envs.options import TaskOptions
@@ -33,11 +34,11 @@ class NativeRows(EngineRows[Commands]):
     def __init__(self, task: Task, options: TaskOptions, n: int, num_threads: int | None) -> None:
         super().__init__(task, options, n)
         self._num_threads = num_threads or os.cpu_count() or 1
-        self._one_change_each = np.arange(n + 1)
         self._injections = replace(commands_of(task.grid, [DO_NOTHING] * n), injects=np.ones(n, np.bool_))
         self._no_injection = (np.zeros(n, np.bool_), np.zeros((n, 0), np.float32))
         if self._catalogue is not None:  # numbers as the engine takes them
-            self._kinds, self._targets = self._catalogue.kind.astype(np.int64), self._catalogue.target.astype(np.int64)
+            kinds, targets = self._catalogue.kind.astype(np.int64), self._catalogue.target.astype(np.int64)
+            self._changes = kinds, targets, self._catalogue.mask.copy()
         self._buffers = [np.zeros((n, self._size), np.float32) for _ in range(2)]
         self._last = np.zeros((n, self._size), np.float32)
 
@@ -99,16 +100,12 @@ class NativeRows(EngineRows[Commands]):
     def _discrete(self, actions: Any) -> Commands:
         assert self._catalogue is not None
         numbers = np.asarray(actions)
-        valid = numbers.shape == (self._n,) and numbers.dtype.kind in "iu"
-        if not valid or numbers.min() < 0 or numbers.max() >= len(self._catalogue):
+        if numbers.shape != (self._n,) or numbers.dtype.kind not in "iu":
             self._check(actions)
-        return Commands(
-            self._one_change_each,
-            self._kinds[numbers],
-            self._targets[numbers],
-            self._catalogue.mask[numbers],
-            *self._no_injection,
-        )
+        chosen, end = numbers.astype(np.int64), np.empty(self._n, np.int64)
+        if not refer_to_choices(chosen, len(self._catalogue), end):
+            self._check(actions)
+        return Commands(chosen, end, *self._changes, *self._no_injection)
 
     def _continuous(self, actions: Any) -> Commands:
         try:

@@ -61,6 +61,25 @@ def blank_report(n: int, n_line: int) -> Report:
 
 
 @jit
+def write_outcomes(address: int, rewards: F64, terminated: Flags, truncated: Flags) -> int:
+    """Write what the last transition of every environment came to, [n] each; how many episodes have ended.
+
+    Args:
+        address: of a handle to the state of ``n`` environments.
+        rewards: sums of the transitions' rewards.
+        terminated: games over.
+        truncated: completed episodes.
+    """
+    state, ended = open_state(address), 0
+    for i in range(rewards.shape[0]):
+        rewards[i] = state.transition_reward[i]
+        terminated[i] = state.terminated[i]
+        truncated[i] = state.truncated[i]
+        ended += terminated[i] or truncated[i]
+    return ended
+
+
+@jit
 def write_report(
     address: int,
     rows: I64,

@@ -52,6 +52,7 @@ def advance(
     counter: NDArray[np.int64],
     begins: bool,
     first: NDArray[np.int64],
+    end: NDArray[np.int64],
     kinds: NDArray[np.int64],
     targets: NDArray[np.int64],
     masks: NDArray[np.uint64],
@@ -70,7 +71,8 @@ def advance(
         rows: environments, int64 [k].
         counter: int64 [1], how many of ``rows`` were taken so far, by all threads that play them together.
         begins: the first rows of episodes are shown; nobody acts.
-        first: where the changes of each agent's action begin, and where the last one's end, int64 [k + 1].
+        first: the first change of each agent's action, int64 [k].
+        end: the change behind its last one, int64 [k].
         kinds: what each change does, an :class:`~rl2grid.mdp.actions.ActionKind`, int64 [change].
         targets: lines or substations, int64 [change].
         masks: moved elements, uint64 [change, word].
@@ -98,7 +100,7 @@ def advance(
         else:
             begin_transition(state, i)
             state.decisions[i] += 1
-            _order(orders, i, k, first, kinds, targets, masks, injects, values)
+            _order(orders, i, k, first, end, kinds, targets, masks, injects, values)
             _step(environments, i, reward, weights, gamma)
             note_action(environments.notes, environments.constants, orders, state, i)
             illegal, ambiguous = state.illegal[i], state.ambiguous[i]
@@ -122,6 +124,7 @@ def _order(
     i: int,
     k: int,
     first: NDArray[np.int64],
+    end: NDArray[np.int64],
     kinds: NDArray[np.int64],
     targets: NDArray[np.int64],
     masks: NDArray[np.uint64],
@@ -130,7 +133,7 @@ def _order(
 ) -> None:
     """Note entry ``k`` of the agents' actions as what row ``i`` is to play."""
     count = 0
-    for change in range(first[k], first[k + 1]):
+    for change in range(first[k], end[k]):
         if kinds[change] == _NOTHING:
             continue
         orders.kind[i, count] = kinds[change]

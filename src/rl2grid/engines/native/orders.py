@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, NamedTuple
 
-from rl2grid.arrays import F32, I32, U64, Flags
+from rl2grid.arrays import F32, I32, I64, U64, Flags
 from rl2grid.compile import jit
 from rl2grid.grids import Grid
 from rl2grid.mdp.actions import ActionKind, StepAction, continuous_layout, mask_words, write_mask
@@ -54,3 +54,13 @@ def order_one_change(orders: Orders, i: int, kind: int, target: int) -> None:
     orders.kind[i, 0] = kind
     orders.target[i, 0] = target
     orders.injects[i] = False
+
+
+@jit
+def refer_to_choices(chosen: I64, n_choices: int, end: I64) -> bool:
+    """Whether all of ``chosen``, int64 [k], are among ``n_choices`` changes; writes the one behind each to ``end``."""
+    for k in range(chosen.shape[0]):
+        if not 0 <= chosen[k] < n_choices:
+            return False
+        end[k] = chosen[k] + 1
+    return True

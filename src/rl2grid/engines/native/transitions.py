@@ -67,10 +67,12 @@ _ROWS_PER_THREAD = 8
 
 @dataclass(frozen=True)
 class Commands:
-    """What the agents of several environments do, one entry each; the changes of all lie behind each other."""
+    """What the agents of several environments do, one entry each, some of the changes that all refer to."""
 
     first: I64
-    """int64 [k + 1], where the changes of each entry begin, and where those of the last one end."""
+    """int64 [k], the first change of each entry."""
+    end: I64
+    """int64 [k], the change behind its last one."""
     kinds: I64
     """int64 [change], an :class:`~rl2grid.mdp.actions.ActionKind`."""
     targets: I64
@@ -87,27 +89,26 @@ class Commands:
 
     def __getitem__(self, part: slice) -> Commands:
         start, stop, _ = part.indices(len(self))
-        if stop - start == len(self):
-            return self
-        return replace(self, first=self.first[start : stop + 1], injects=self.injects[part], values=self.values[part])
+        return self if stop - start == len(self) else self._only(part)
 
     def take(self, rows: I64) -> Commands:
         """The entries ``rows``."""
-        if len(rows) == len(self):
-            return self
-        counts = np.diff(self.first)[rows]
-        first = np.concatenate(([0], np.cumsum(counts)))
-        changes = np.repeat(self.first[rows] - first[:-1], counts) + np.arange(first[-1])
-        return Commands(
-            first, self.kinds[changes], self.targets[changes], self.masks[changes], self.injects[rows],
-            self.values[rows],
-        )  # fmt: skip
+        return self if len(rows) == len(self) else self._only(rows)
+
+    def _only(self, entries: slice | I64) -> Commands:
+        return replace(
+            self,
+            first=self.first[entries],
+            end=self.end[entries],
+            injects=self.injects[entries],
+            values=self.values[entries],
+        )
 
     def action(self, k: int) -> StepAction:
         """One entry as an action."""
         changes = tuple(
             Change(int(self.kinds[c]), int(self.targets[c]), mask_integer(self.masks[c]))
-            for c in range(int(self.first[k]), int(self.first[k + 1]))
+            for c in range(int(self.first[k]), int(self.end[k]))
             if self.kinds[c] != ActionKind.NOTHING
         )
         return StepAction(changes, self.values[k] if self.injects[k] else None)
@@ -130,8 +131,10 @@ def commands_of(grid: Grid, actions: Sequence[StepAction]) -> Commands:
     for k, action in enumerate(actions):
         if action.values is not None:
             values[k] = action.values
+    ends = np.cumsum([0, *(len(action.changes) for action in actions)], dtype=np.int64)
     return Commands(
-        np.cumsum([0, *(len(action.changes) for action in actions)], dtype=np.int64),
+        ends[:-1],
+        ends[1:],
         np.array([change.kind for change in changes], np.int64),
         np.array([change.target for change in changes], np.int64),
         masks,
@@ -320,6 +323,7 @@ class NativeTransitions(Transitions):
             counter,
             begins,
             commands.first,
+            commands.end,
             commands.kinds,
             commands.targets,
             commands.masks,
