@@ -6,20 +6,22 @@
 
 Processor time of whole steps, of which are apart:
 
-- the engine: its compiled calls, transitions (``play_rows``) and observations (``write_observations``, those of endings
-  included), with what hands them their arrays;
+- the engine: its two compiled calls, ``advance`` (transitions) and ``write_observations`` (those of endings included);
 - beginnings: new episodes where some have ended, with the months that are made or opened for them;
-- the vector: all else, which is checks of actions, infos of all environments and of endings, effects, buffers.
+- the vector: all else, which is checking actions and handing them over, infos of all environments and of endings,
+  effects, buffers.
 
 Played are random actions, of which many end episodes, and nothing, the cheapest step of the engine. It writes
 ``benchmarks/results/vector_step.json``: microseconds per step of all 256 environments, and the vector's share of the
 engine's time, medians of the rounds (each the median of its steps). Masks of actions, for which one asks, are measured
-beside.
+beside. Processor time counts caches that other processes have emptied, the vector's more than the engine's: the load of
+the machine is noted.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import statistics
 import time
 from collections.abc import Callable
@@ -30,14 +32,15 @@ import gymnasium
 import numpy as np
 
 import rl2grid  # noqa: F401 - registers the tasks
+from rl2grid.engines.native import transitions
 from rl2grid.records.files import write_json
 
 RESULTS = Path(__file__).parent / "results" / "vector_step.json"
 TASKS = ("bus14-T0", "bus36-MO-v0-T0", "bus118-M-T0")
 PLAYS = ("random", "nothing")
 NUM_ENVS = 256
-PARTS = {"engine": ("play_rows", "write_observations"), "beginnings": ("_begin",)}
-"""Methods of the transitions and of the rows that are timed apart."""
+ENGINE, BEGINNINGS = "engine", "beginnings"
+COMPILED = transitions.advance, transitions.write_observations
 
 
 class Clock:
@@ -69,11 +72,10 @@ class Steps:
     def __init__(self, task: str, play: str) -> None:
         self.envs: Any = gymnasium.make_vec(f"rl2grid/{task}-v0", num_envs=NUM_ENVS, num_threads=1)
         self.play, self.random, self.clock = play, np.random.default_rng(0), Clock()
+        transitions.advance = self.clock.time(ENGINE, COMPILED[0])
+        transitions.write_observations = self.clock.time(ENGINE, COMPILED[1])
         rows = self.envs.unwrapped._rows
-        for part, names in PARTS.items():
-            owner = rows.transitions if part == "engine" else rows
-            for name in names:
-                setattr(owner, name, self.clock.time(part, getattr(owner, name)))
+        rows._begin = self.clock.time(BEGINNINGS, rows._begin)
         self.envs.reset(seed=0)
 
     def step(self) -> dict[str, float]:
@@ -81,13 +83,13 @@ class Steps:
         actions = np.zeros(NUM_ENVS, np.int64)
         if self.play == "random":
             actions = self.random.integers(self.envs.single_action_space.n, size=NUM_ENVS)
-        self.clock.seconds = dict.fromkeys(PARTS, 0.0)
+        self.clock.seconds = dict.fromkeys((ENGINE, BEGINNINGS), 0.0)
         began = time.thread_time()
         _, _, terminated, truncated, _ = self.envs.step(actions)
         parts = self.clock.seconds | {"step": time.thread_time() - began}
         parts["vector"] = parts["step"] - sum(self.clock.seconds.values())
         return {part: 1e6 * seconds for part, seconds in parts.items()} | {
-            "vector_over_engine": parts["vector"] / parts["engine"],
+            "vector_over_engine": parts["vector"] / parts[ENGINE],
             "endings": float((terminated | truncated).sum()),
         }
 
@@ -125,7 +127,13 @@ def main() -> None:
     parser.add_argument("--tasks", nargs="+", default=TASKS)
     parser.add_argument("--output", type=Path, default=RESULTS)
     options = parser.parse_args()
-    results: dict[str, Any] = {"environments": NUM_ENVS, "threads": 1, "unit": "microseconds of a step of all of them"}
+    results: dict[str, Any] = {
+        "environments": NUM_ENVS,
+        "threads": 1,
+        "unit": "microseconds of a step of all of them",
+        "processors": os.cpu_count(),
+        "load_before": round(os.getloadavg()[0], 1),
+    }
     for task in options.tasks:
         for play in PLAYS:
             results[f"{task} {play}"] = measured = measure(task, play, options.rounds, options.steps)
