@@ -28,6 +28,7 @@ from rl2grid.algorithms.networks import (
     Output,
     Request,
     find_network,
+    mlp,
     network_names,
     register_network,
 )
@@ -232,3 +233,14 @@ def test_a_result_from_before_networks_could_be_chosen_is_found_again(digest: st
     assert identity_hash({**configuration, "hyperparameters": identifying(now)}) == digest
     other = identity_hash({**configuration, "hyperparameters": identifying(replace(now, network="lines"))})
     assert other != digest
+
+
+def test_tanh_and_its_gradient_are_those_of_pytorch():
+    inputs = torch.linspace(-12.0, 12.0, 4001, requires_grad=True)
+    outputs = mlp.Layers(nn.Tanh())(inputs)
+    expected = torch.tanh(inputs)
+    torch.testing.assert_close(outputs, expected, rtol=0.0, atol=2e-7)
+    (mine,), (theirs,) = (torch.autograd.grad(each.square().sum(), inputs) for each in (outputs, expected))
+    torch.testing.assert_close(mine, theirs, rtol=0.0, atol=1e-6)
+    with torch.no_grad():
+        assert torch.equal(mlp.Layers(nn.Tanh())(inputs), outputs)
