@@ -1,9 +1,9 @@
 """Whether fewer gradients a decision learn as much from each: hyperparameters side by side, on validation months.
 
-``python benchmarks/equal_learning.py [--loops sac,dqn,td3,ppo] [--seeds 2] [--months 30]`` trains every variant of a
-loop on bus14 with the same budget of decisions and the same seeds, plays the policy as it is after every third of the
-budget on validation months, and adds to ``benchmarks/results/equal_learning.json`` what is not there yet: survival and
-processor seconds of training, one thread. Test months are never played.
+``python benchmarks/equal_learning.py [--loops sac,dqn,td3,ppo] [--budget N] [--seeds 2] [--months 30]`` trains every
+variant of a loop on bus14 with the same budget of decisions and the same seeds, plays the policy as it is after every
+third of the budget on validation months, and adds to ``benchmarks/results/equal_learning.json`` what is not there yet:
+survival and processor seconds of training, one thread. Test months are never played.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Loop:
     @property
     def name(self) -> str:
         """As in the results."""
-        return f"{self.algorithm} {self.task} {self.heuristic or 'plain'}"
+        return f"{self.algorithm} {self.task} {self.heuristic or 'plain'} {self.budget}"
 
 
 _LARGE_STEPS = {"train_frequency": 32, "actor_learning_rate": 1e-3, "critic_learning_rate": 3e-3, "tau": 0.03}
@@ -89,6 +89,20 @@ LOOPS: tuple[Loop, ...] = (
         {
             "10 epochs": {"update_epochs": 10, "actor_learning_rate": 1e-3, "critic_learning_rate": 1e-3},
             "3 epochs": {"update_epochs": 3, "actor_learning_rate": 3e-3, "critic_learning_rate": 3e-3},
+            "10 epochs, 64 environments": {
+                "num_envs": 64, "update_epochs": 10, "actor_learning_rate": 1e-3, "critic_learning_rate": 1e-3
+            },
+            "3 epochs, 64 environments": {
+                "num_envs": 64, "update_epochs": 3, "actor_learning_rate": 3e-3, "critic_learning_rate": 3e-3
+            },
+        },
+    ),
+    Loop(
+        "ppo",
+        "bus14-T0",
+        "idle",
+        196_608,
+        {
             "10 epochs, 64 environments": {
                 "num_envs": 64, "update_epochs": 10, "actor_learning_rate": 1e-3, "critic_learning_rate": 1e-3
             },
@@ -148,13 +162,14 @@ def main() -> None:
     """Train what is asked for and not there yet."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--loops", default="sac,dqn,td3,ppo", help="algorithms")
+    parser.add_argument("--budget", type=int, default=None, help="only loops of so many decisions")
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--months", type=int, default=30)
     parser.add_argument("--results", type=Path, default=RESULTS)
     arguments = parser.parse_args()
     results = json.loads(arguments.results.read_text()) if arguments.results.exists() else {}
     for loop in LOOPS:
-        if loop.algorithm not in arguments.loops.split(","):
+        if loop.algorithm not in arguments.loops.split(",") or arguments.budget not in (None, loop.budget):
             continue
         for variant, changes in loop.variants.items():
             for seed in range(1, arguments.seeds + 1):
