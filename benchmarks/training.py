@@ -14,6 +14,7 @@ and Grid2Op doing nothing. Cases:
 - ``ppo``, ``sac``: a training loop of ``benchmarks/loop_speed.py``, two threads for the grid, wall clock.
 - ``first_step``: from the start of a process to the end of the first step of 256 environments, on an empty data folder,
   with compiled code there.
+- ``threads``: 256 environments, one thread and two in turns, wall clock.
 - ``library``: ``rl2grid data make GRID --split train`` on an empty data folder, two processes.
 
 It writes ``benchmarks/results/training.json``: medians of the rounds, the ratio to before, and to Grid2Op.
@@ -67,6 +68,30 @@ sys.path.insert(0, "benchmarks")
 import loop_speed
 algorithm, task, heuristic, seconds = sys.argv[1], sys.argv[2], sys.argv[3], float(sys.argv[4])
 print(json.dumps(loop_speed.measure(algorithm, task, None if heuristic == "none" else heuristic, seconds)))
+"""
+_THREADS = """
+import json, statistics, sys, time
+import gymnasium, numpy as np
+import rl2grid
+task, play, rounds = sys.argv[1], sys.argv[2], int(sys.argv[3])
+n = 256
+both = [gymnasium.make_vec(f"rl2grid/{task}-v0", num_envs=n, num_threads=k, heuristic=None) for k in (1, 2)]
+numbers = both[0].single_action_space.n
+for envs in both:
+    envs.reset(seed=0)
+seconds = []
+for number in range(rounds + 1):
+    took = []
+    for envs in both:
+        generator = np.random.default_rng(number)
+        began = time.perf_counter()
+        for _ in range(40):
+            envs.step(generator.integers(numbers, size=n) if play == "random" else np.zeros(n, np.int64))
+        took.append(time.perf_counter() - began)
+    seconds.append(took)
+ratios = [one / two for one, two in seconds[1:]]
+median, least, most = (round(pick(ratios), 2) for pick in (statistics.median, min, max))
+print(json.dumps({"two_over_one": {"median": median, "min": least, "max": most}}))
 """
 _FIRST_STEP = """
 import sys
@@ -190,6 +215,10 @@ def main() -> None:
                 entry["grid2op"] = summary(peer)
                 entry["now_over_grid2op"] = summary([a / b for a, b in zip(rates["now"], peer, strict=True)])
             write(result, name, entry)
+    for task in TASKS:
+        for play in ("random", "nothing"):
+            if is_wanted(f"threads {task} {play}"):
+                write(result, f"threads {task} {play}", run(ROOT, _THREADS, task, play, str(2 * options.rounds)))
     for grid, task in zip(grids, TASKS, strict=True):
         if is_wanted(f"first_step {task}"):
             values = [seconds_on_empty_folder(ROOT, _FIRST_STEP, task) for _ in range(options.rounds)]

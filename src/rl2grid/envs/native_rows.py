@@ -57,15 +57,14 @@ class NativeRows(EngineRows[Commands]):
     def _begin_episodes(self, rows: list[int], positions: list[StreamPosition]) -> list[EpisodePlan]:
         if not self._plays_library(positions):
             return super()._begin_episodes(rows, positions)
-        plans = self.transitions.begin_training(
+        make_library_beside(self.grid)
+        return self.transitions.begin_training(
             np.array(rows),
             np.array([position.seed for position in positions], np.int64),
             np.array([position.number for position in positions], np.int64),
             self.options.maintenance,
             self._num_threads,
         )
-        make_library_beside(self.grid)
-        return plans
 
     def _plays_library(self, positions: list[StreamPosition]) -> bool:
         """Whether episodes are drawn from the library of training years, and nobody chooses anything of them."""

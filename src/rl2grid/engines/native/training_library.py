@@ -63,7 +63,8 @@ class TrainingLibrary:
         """
         addresses = self._handle.structure.address
         with self._lock:
-            for number in np.unique(years[addresses[years, 0] == 0]).tolist():
+            # The last first: who makes the library beside begins with the first.
+            for number in np.unique(years[addresses[years, 0] == 0])[::-1].tolist():
                 year = training_year(self._grid, FIRST_TRAINING_SEED + number)
                 self._years[number] = year
                 addresses[number] = [array.ctypes.data for array in (year.load_p, year.load_q, year.prod_p)]
