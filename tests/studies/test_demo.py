@@ -59,6 +59,6 @@ def test_the_readme_shows_the_published_figures():
     published = demo.published()
     readme = Path(__file__).parents[2].joinpath("README.md").read_text(encoding="utf-8")
     assert published["processor"] in readme
-    rows = {"PPO": "PPO + idle", "do-nothing": "do nothing", "random": "random + idle"}
+    rows = {"DQN": "DQN + idle", "do-nothing": "do nothing", "random": "random + idle"}
     for agent, value in published["survival"].items():
         assert f"| {rows[agent]} | {value:.3f} [" in readme

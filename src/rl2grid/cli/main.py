@@ -25,7 +25,7 @@ INTERRUPTED = 130
 """Exit status after an interrupt, as shells have it."""
 
 COMMANDS: dict[str, str] = {
-    "demo": "train PPO on bus14, evaluate it beside simple agents, write a report",
+    "demo": "train DQN on bus14, evaluate it beside simple agents, write a report",
     "tasks": "list the tasks (103 on the seven grids) and their sizes",
     "train": "train an algorithm on a task",
     "evaluate": "play agents on enumerated scenarios, one row per episode",

@@ -36,8 +36,9 @@ from rl2grid.training.validation import validator
 
 TASK = "rl2grid/bus14-T0-v0"
 HEURISTIC = "idle"
-DECISIONS = 192_000
-"""Two to three minutes on two cores."""
+ALGORITHM, NAME = "dqn", "DQN"
+DECISIONS = 49_152
+"""Less than a minute on two cores: on months of validation, three seeds survived 0.90 to 0.97 afterwards."""
 NUM_ENVS = 64
 """Enough to keep the cores busy while some environments play hours of calm between two decisions."""
 MONTHS = 100
@@ -57,7 +58,7 @@ class Demonstration:
 
 
 def run_demo(output: Path, decisions: int | None = None, *, progress: bool = True) -> Demonstration:
-    """Train PPO with the idle heuristic on bus14, evaluate it on held-out months, write a report.
+    """Train DQN with the idle heuristic on bus14, evaluate it on held-out months, write a report.
 
     Args:
         output: folder of the report, ``report.html`` in it; ``output / "run"`` holds the training.
@@ -70,7 +71,7 @@ def run_demo(output: Path, decisions: int | None = None, *, progress: bool = Tru
     make_own_folder(output, ("run", "report.html"), "demonstration")
     console = Console(stderr=True, quiet=not progress)
     register_all()
-    console.rule("1/4 Training PPO with the idle heuristic on bus14", align="left")
+    console.rule(f"1/4 Training {NAME} with the idle heuristic on bus14", align="left")
     console.print("Whenever a line is loaded to 95%, the agent chooses one of 50 topology actions.")
     run = _train(output / "run", DECISIONS if decisions is None else decisions, progress)
     if not runs.is_finished(run):
@@ -86,12 +87,12 @@ def run_demo(output: Path, decisions: int | None = None, *, progress: bool = Tru
     report = write_demo_report(
         output,
         results,
-        title="PPO on bus14",
+        title=f"{NAME} on bus14",
         introduction=(
-            "An agent that acts only when a line is loaded to 95%, trained for minutes, beside doing nothing and "
+            "An agent that acts only when a line is loaded to 95%, trained for a minute, beside doing nothing and "
             f"acting at random, on {MONTHS} months that none of them has seen."
         ),
-        curves=[read_training_curve(run, "PPO with the idle heuristic")],
+        curves=[read_training_curve(run, f"{NAME} with the idle heuristic")],
         recordings=[recording],
         commands=dict.fromkeys(("training", "episodes"), demo_command(output, decisions)),
     )
@@ -140,7 +141,7 @@ def _contestants(run: Path) -> list[tuple[str, str | None]]:
 
 def _train(folder: Path, decisions: int, progress: bool) -> Path:
     """Begin the run, or go on with it; a complete run is left as it is."""
-    hyperparameters = request.hyperparameters("ppo", TASK, total_timesteps=decisions, num_envs=NUM_ENVS)
+    hyperparameters = request.hyperparameters(ALGORITHM, TASK, total_timesteps=decisions, num_envs=NUM_ENVS)
     if folder.exists():
         stored, _ = request.read_config(folder)
         if stored.hyperparameters != hyperparameters:
@@ -149,6 +150,7 @@ def _train(folder: Path, decisions: int, progress: bool) -> Path:
     args = request.RunArgs(
         task=find_task(TASK),
         hyperparameters=hyperparameters,
+        algorithm=ALGORITHM,
         folder=folder,
         env_keywords={"heuristic": HEURISTIC},
         evaluate_every=max(decisions // 8, 1),
@@ -158,7 +160,7 @@ def _train(folder: Path, decisions: int, progress: bool) -> Path:
 
 
 def _evaluate(agent: str, heuristic: str | None, output: Path, progress: bool) -> Evaluation:
-    name = agent if agent in ("do-nothing", "random") else "PPO"
+    name = agent if agent in ("do-nothing", "random") else NAME
     return evaluate(
         agent,
         TASK,
