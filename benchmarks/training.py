@@ -7,11 +7,9 @@
 Each round runs every case in a process of its own, with the package as it is and as it was at ``REVISION``, in turns,
 and Grid2Op doing nothing. Cases:
 
-- ``random``: random actions of the task's smallest set, no heuristic, 256 environments, one thread; seconds are of
-  processor time, and include months that are made meanwhile. As it is, all of the library is there before (its making
-  is the case ``library``); as it was, months were made as episodes drew them, without end.
+- ``random``: random actions of the task's smallest set, no heuristic, 256 environments, one thread, per second of
+  processor time. A first round that does not count makes the months that are played, in both revisions.
 - ``nothing``: doing nothing, 64 environments, one thread.
-- ``ppo``, ``sac``: a training loop of ``benchmarks/loop_speed.py``, two threads for the grid, wall clock.
 - ``first_step``: from the start of a process to the end of the first step of 256 environments, on an empty data folder,
   with compiled code there.
 - ``threads``: 256 environments, one thread and two in turns, wall clock.
@@ -61,13 +59,6 @@ while time.perf_counter() - began < seconds:
     steps += n
     ended += int((terminated | truncated).sum())
 print(json.dumps({"decisions_per_s": steps / (time.process_time() - spent), "episodes": ended}))
-"""
-_LEARN = """
-import json, sys
-sys.path.insert(0, "benchmarks")
-import loop_speed
-algorithm, task, heuristic, seconds = sys.argv[1], sys.argv[2], sys.argv[3], float(sys.argv[4])
-print(json.dumps(loop_speed.measure(algorithm, task, None if heuristic == "none" else heuristic, seconds)))
 """
 _THREADS = """
 import json, statistics, sys, time
@@ -123,30 +114,21 @@ def cases() -> dict[str, tuple[str, ...]]:
     for task in TASKS:
         found[f"random {task}"] = (_PLAY, task, "256", "random", str(SECONDS))
         found[f"nothing {task}"] = (_PLAY, task, "64", "nothing", str(SECONDS))
-    for algorithm, task, heuristic in (
-        ("ppo", "bus14-T0", "none"),
-        ("ppo", "bus14-T0", "idle"),
-        ("ppo", "bus36-MO-v0-T0", "idle"),
-        ("ppo", "bus118-M-T0", "idle"),
-        ("sac", "bus14-T0", "recovery"),
-    ):
-        found[f"{algorithm} {task} {heuristic}"] = (_LEARN, algorithm, task, heuristic, str(2 * SECONDS))
     return found
 
 
-def run(source: Path, script: str, *arguments: str, data: Path | None = None) -> dict[str, Any]:
+def output_of(source: Path, script: str, *arguments: str, data: Path | None = None) -> bytes:
     """What a script prints, in a process with the package of ``source``."""
     variables = {"PYTHONPATH": str(source / "src"), "OPENBLAS_NUM_THREADS": "1", "RL2GRID_QUIET": "1"}
     if data is not None:
         variables["RL2GRID_DATA"] = str(data)
-    answer = subprocess.run(
-        [sys.executable, "-c", script, *arguments],
-        cwd=source,
-        env=os.environ | variables,
-        stdout=subprocess.PIPE,
-        check=True,
-    )
-    return dict(json.loads(answer.stdout.splitlines()[-1])) if answer.stdout else {}
+    command = [sys.executable, "-c", script, *arguments]
+    return subprocess.run(command, cwd=source, env=os.environ | variables, stdout=subprocess.PIPE, check=True).stdout
+
+
+def run(source: Path, script: str, *arguments: str) -> dict[str, Any]:
+    """The record that a script prints last."""
+    return dict(json.loads(output_of(source, script, *arguments).splitlines()[-1]))
 
 
 @contextmanager
@@ -164,7 +146,7 @@ def seconds_on_empty_folder(source: Path, script: str, *arguments: str) -> float
     """How long a script takes with an empty data folder."""
     with tempfile.TemporaryDirectory() as data:
         began = time.perf_counter()
-        run(source, script, *arguments, data=Path(data))
+        output_of(source, script, *arguments, data=Path(data))
         return time.perf_counter() - began
 
 
