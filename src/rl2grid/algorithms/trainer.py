@@ -44,9 +44,6 @@ from rl2grid.envs.normalization import CLIP, ObservationNormalizer
 from rl2grid.envs.spec import spec_of
 from rl2grid.errors import UsageError
 
-LEAST_VARIANCE = 1e-8
-"""Added to the variance of every feature before it is divided by, as :class:`ObservationNormalizer` does."""
-
 
 class Played(NamedTuple):
     """What a decision in every environment led to; every array is [num_envs, ...]."""
@@ -262,6 +259,5 @@ class Trainer(ABC):
         if self._scale_of != self.normalizer.count:
             self._scale_of = self.normalizer.count
             self._mean = self.tensor(self.normalizer.mean, torch.float32)
-            deviation = np.sqrt(self.normalizer.variance + LEAST_VARIANCE)
-            self._factor = self.tensor(1.0 / deviation, torch.float32)
+            self._factor = self.tensor(1.0 / self.normalizer.deviation, torch.float32)
         return ((given - self._mean) * self._factor).clamp_(-CLIP, CLIP)

@@ -44,6 +44,12 @@ class ObservationNormalizer:
         """Population variance of every feature [size]; 1 before the first observation."""
         return self._squares / self.count if self.count else np.ones_like(self._squares)
 
+    @property
+    def deviation(self) -> NDArray[np.float64]:
+        """Standard deviation of every feature [size], as it is divided by: never 0."""
+        deviation: NDArray[np.float64] = np.sqrt(self.variance + _EPSILON)
+        return deviation
+
     def freeze(self) -> None:
         """Ignore all further updates; evaluation must not move what training learned to read."""
         self._frozen = True
@@ -63,7 +69,7 @@ class ObservationNormalizer:
 
     def normalize(self, observations: NDArray[Any]) -> NDArray[np.float32]:
         """Observations [..., size] as multiples of the standard deviation around the mean, clipped, float32."""
-        scaled = (observations - self.mean) / np.sqrt(self.variance + _EPSILON)
+        scaled = (observations - self.mean) / self.deviation
         return np.clip(scaled, -CLIP, CLIP).astype(np.float32)
 
     def state_dict(self) -> dict[str, Any]:
