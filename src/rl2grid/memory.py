@@ -2,33 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir
 from numba.core import types
 from numba.core.extending import intrinsic
 
-
-@intrinsic  # type: ignore[untyped-decorator]
-def float32_at(typing_context: Any, address: Any, index: Any) -> Any:
-    """The float32 number ``index`` places after ``address``."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        pointer = builder.inttoptr(arguments[0], ir.FloatType().as_pointer())
-        return builder.load(builder.gep(pointer, [arguments[1]]))
-
-    return types.float32(types.int64, types.int64), generate
+from rl2grid.arrays import Index
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def int16_at(typing_context: Any, address: Any, index: Any) -> Any:
-    """The int16 number ``index`` places after ``address``."""
+def _reader(number: types.Number) -> Callable[[Index, Index], Any]:
+    """A function for compiled code: the number so many places after an address."""
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        pointer = builder.inttoptr(arguments[0], ir.IntType(16).as_pointer())
-        return builder.load(builder.gep(pointer, [arguments[1]]))
+    @intrinsic  # type: ignore[untyped-decorator]
+    def number_at(typing_context: Any, address: Any, index: Any) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            pointer = builder.inttoptr(arguments[0], context.get_data_type(number).as_pointer())
+            return builder.load(builder.gep(pointer, [arguments[1]]))
 
-    return types.int16(types.int64, types.int64), generate
+        return number(types.int64, types.int64), generate
+
+    result: Callable[[Index, Index], Any] = number_at
+    return result
+
+
+float32_at, int16_at = _reader(types.float32), _reader(types.int16)
 
 
 @intrinsic  # type: ignore[untyped-decorator]

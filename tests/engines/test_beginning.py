@@ -8,6 +8,7 @@ import pytest
 
 import rl2grid  # noqa: F401  (registers the tasks)
 from rl2grid.engines.native.engine import NativeEngine
+from rl2grid.engines.native.training_library import training_library
 from rl2grid.grids import GRID_IDS, Grid, load_grid
 from rl2grid.scenarios.episodes import EpisodePlan, plan_episode
 from rl2grid.structures import Role, fields_of
@@ -18,9 +19,10 @@ _DRAWN = ("waits", "durations", "choices")
 
 def begun(grid: Grid, seeds: np.ndarray, numbers: np.ndarray, maintained: bool) -> tuple[NativeEngine, list[Any]]:
     engine, rows = NativeEngine(grid, len(seeds)), np.arange(len(seeds))
-    draws = engine.draw_training(seeds, numbers)
-    engine.show_training(0, rows, draws, maintained)
-    return engine, engine.take_training(rows, draws, maintained)
+    library = training_library(grid)
+    draws = engine.draw_training(library, seeds, numbers)
+    engine.show_training(library, 0, rows, draws, maintained)
+    return engine, engine.take_training(library, rows, draws, maintained)
 
 
 def assert_same(first: NativeEngine, second: NativeEngine) -> None:

@@ -19,7 +19,6 @@ from rl2grid.envs.tasks import Task
 from rl2grid.grids import find_system
 from rl2grid.mdp.actions import DO_NOTHING
 from rl2grid.scenarios.episodes import EpisodePlan
-from rl2grid.scenarios.making import make_library_beside
 from rl2grid.scenarios.months import GeneratedScenarios
 from rl2grid.scenarios.splits import TRAIN
 
@@ -57,7 +56,6 @@ class NativeRows(EngineRows[Commands]):
     def _begin_episodes(self, rows: list[int], positions: list[StreamPosition]) -> list[EpisodePlan]:
         if not self._plays_library(positions):
             return super()._begin_episodes(rows, positions)
-        make_library_beside(self.grid)
         return self.transitions.begin_training(
             np.array(rows),
             np.array([position.seed for position in positions], np.int64),

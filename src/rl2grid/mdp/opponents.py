@@ -222,7 +222,7 @@ def draw_attacks(opponent: OpponentState, i: int, seed: int, key: int, n_steps: 
     What :func:`draw_opponent` draws and :func:`load_draws` loads, in compiled code.
 
     Args:
-        opponent: The opponents, with room for the attacks of such an episode.
+        opponent: The opponents, with room for the attacks of such an episode, and of no longer one.
         i: The environment.
         seed: Of the stream.
         key: Of the stream, see :func:`rl2grid.philox.fill_uniforms`.
@@ -231,14 +231,12 @@ def draw_attacks(opponent: OpponentState, i: int, seed: int, key: int, n_steps: 
     blank_row(opponent, i)
     opponent.budget[i] = opponent.initial_budget[0]
     opponent.attack_cooldown[i] = opponent.cooldown[0]
-    kind, n_areas = opponent.kind[0], opponent.n_lines.size
-    if kind == _NONE:
+    if opponent.kind[0] == _NONE:
         return
-    shortest = opponent.max_duration[0] if kind == _WEIGHTED else opponent.minimum_duration[0] + 2
-    capacity = n_steps // max(shortest, 1) + 1
+    n_areas = opponent.n_lines.size
     numbers = np.empty((_ATTACKS_AT_ONCE, n_areas, 3))
     launched = np.zeros(n_areas, np.int64)
-    for attack in range(capacity):
+    for attack in range(opponent.waits.shape[2]):
         place = attack % _ATTACKS_AT_ONCE
         if place == 0:
             fill_uniforms(seed, key, attack * n_areas * 3, numbers.reshape(-1))

@@ -25,7 +25,7 @@ from rl2grid.handles import Handle
 from rl2grid.scenarios.cache import cached_series, data_folder, is_cached
 from rl2grid.scenarios.fingerprint import generator_fingerprint
 from rl2grid.scenarios.folder import FolderContent
-from rl2grid.scenarios.generator.calendar import MONTH_STEPS, month_start
+from rl2grid.scenarios.generator.calendar import MONTH_STEPS, month_and_row, month_start
 from rl2grid.scenarios.generator.constants import load_constants
 from rl2grid.scenarios.generator.forecast import ForecastModel, forecast_model, forecast_row
 from rl2grid.scenarios.generator.month import RawMonth, month_of_year
@@ -114,16 +114,11 @@ class TrainingMonths:
         part = slice(self.first_row_of_year + first, self.first_row_of_year + stop)
         return self.year.load_p[part], self.year.load_q[part], self.year.prod_p[part]
 
-    def month_and_row(self, row: int) -> tuple[int, int]:
-        """The month (0 .. 11) that forecasts in a row, and which row of that month it is."""
-        month = min(row // MONTH_STEPS, self.months.n_months - 1)
-        return self.months.first + month, row - month * MONTH_STEPS
-
     def forecasts(self, row: int) -> tuple[F32, F32, F32]:
         """What a row forecasts: active and reactive demand, production; MW, float32 [horizon, element]."""
-        model = forecasts_of(self.grid).model.structure
-        horizon = int(model.horizon[0])
-        month, local = self.month_and_row(row)
+        model = forecasts_of(self.grid).model
+        horizon = int(model.structure.horizon[0])
+        later, place = month_and_row(row, self.months.n_months)
         load_p, load_q, prod_p = self.rows(row + 1, row + 1 + horizon)
         forecast = (
             np.empty(load_p.shape, np.float32),
@@ -132,7 +127,7 @@ class TrainingMonths:
         )
         for k in range(horizon):
             rows = load_p[k], load_q[k], prod_p[k], *(out[k] for out in forecast)
-            forecast_row(model, self.months.seed, month, local, k + 1, *rows)
+            forecast_row(model.address, self.months.seed, self.months.first + later, place, k + 1, *rows)
         return forecast
 
 

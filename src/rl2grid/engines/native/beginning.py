@@ -150,7 +150,7 @@ def _show(
     hidden.last_row[i] = _ENDLESS
     hidden.year[i] = _FIRST_SEED + year
     hidden.month[i] = month
-    hidden.last_month[i] = month + _MONTHS_IN_A_ROW - 1
+    hidden.n_months[i] = _MONTHS_IN_A_ROW
     hidden.month_row[i] = start
     hidden.outage_count[i] = 0
     if maintained:

@@ -26,7 +26,7 @@ from rl2grid.engines.native.hidden_state import new_hidden_state
 from rl2grid.engines.native.imagination import imagined_rows, outlook_of
 from rl2grid.engines.native.orders import write_order
 from rl2grid.engines.native.playing import Playing, playing_named, playing_series
-from rl2grid.engines.native.training_library import training_library
+from rl2grid.engines.native.training_library import TrainingLibrary
 from rl2grid.engines.native.worlds import RowLayout, restore_row, save_row
 from rl2grid.engines.worlds import Home, Outlook, SeriesName, World, grid_fingerprint
 from rl2grid.errors import UsageError, one_of
@@ -137,28 +137,25 @@ class NativeEngine:
         for flags in (state.terminated, state.truncated, state.illegal, state.ambiguous, state.attacked, state.excused):
             flags[i] = False
 
-    def draw_training(self, seeds: I64, numbers: I64) -> Draws:
-        """Which months of the library the training episodes ``numbers`` of ``seeds`` play; they are there then.
+    def draw_training(self, library: TrainingLibrary, seeds: I64, numbers: I64) -> Draws:
+        """Which months of ``library`` the training episodes ``numbers`` of ``seeds`` play; they are there then.
 
         Raises:
             UsageError: the data folder cannot be written, or has no room for the library.
         """
         draws = Draws(seeds, numbers, *(np.zeros_like(seeds) for _ in Draws._fields[2:]))
         draw_months(np.array(YEARS_FOR_FIRST), draws)
-        library = training_library(self.grid)
         library.open(draws.year)
         self._make_room(library.most_outages)
         return draws
 
-    def show_training(self, thread: int, rows: I64, draws: Draws, maintained: bool) -> None:
+    def show_training(self, library: TrainingLibrary, thread: int, rows: I64, draws: Draws, maintained: bool) -> None:
         """Show the first rows of the episodes that were drawn, in ``rows``; threads may show different ones."""
-        library = training_library(self.grid).address
-        begin_episodes(self.address_for(thread), library, rows, draws, maintained, self._attacks)
+        begin_episodes(self.address_for(thread), library.address, rows, draws, maintained, self._attacks)
 
-    def take_training(self, rows: I64, draws: Draws, maintained: bool) -> list[EpisodePlan]:
+    def take_training(self, library: TrainingLibrary, rows: I64, draws: Draws, maintained: bool) -> list[EpisodePlan]:
         """Note what was begun in ``rows``; returns the plans of the episodes."""
-        library, hidden = training_library(self.grid), self.environments.hidden
-        plans = []
+        hidden, plans = self.environments.hidden, []
         for i, seed, number, year, month, start, redraws in zip(
             rows.tolist(), *map(np.ndarray.tolist, draws), strict=True
         ):

@@ -67,7 +67,7 @@ class HiddenState(NamedTuple):
     ]
     year: Annotated[I64, episode("", "seed of the training year whose integers are played; 0: no such year is")]
     month: Annotated[I32, episode("", "first month played of that year, 0 .. 11")]
-    last_month: Annotated[I32, episode("", "last month played of that year")]
+    n_months: Annotated[I32, episode("", "months played of that year, in a row")]
     month_row: Annotated[I32, episode("", "row of its first month that the reset shows")]
     horizons: Annotated[I32, episode("", "that each row forecasts", "steps")]
     last_row: Annotated[I32, episode("", "whose row of the series all later steps repeat", "step")]

@@ -47,8 +47,7 @@ class Playing:
         hidden.year[i] = 0
         if isinstance(self.source, TrainingMonths):
             assert isinstance(self.name, SeriesName)
-            hidden.year[i], hidden.month[i], _ = self.source.months
-            hidden.last_month[i] = self.source.months.numbers[-1]
+            hidden.year[i], hidden.month[i], hidden.n_months[i] = self.source.months
             hidden.month_row[i] = self.name.start
         self.go_on(hidden, i)
 

@@ -14,12 +14,9 @@ from rl2grid.arrays import F32, I16
 from rl2grid.compile import jit, owning_jit
 from rl2grid.engines.native.environments import Environments
 from rl2grid.engines.native.hidden_state import LOAD_P, LOAD_Q, PROD_P, PROD_V, HiddenState
-from rl2grid.handles import opener
 from rl2grid.memory import float32_at, int16_at
-from rl2grid.scenarios.generator.calendar import MONTH_STEPS
-from rl2grid.scenarios.generator.forecast import ForecastModel, forecast_row
-
-_open_forecast_model = opener(ForecastModel)
+from rl2grid.scenarios.generator.calendar import month_and_row
+from rl2grid.scenarios.generator.forecast import forecast_row
 
 
 @jit
@@ -110,13 +107,12 @@ def _make_forecast(environments: Environments, i: int, source: HiddenState, row:
     active = _integers(source.series[row, LOAD_P], step + horizon, hidden.load_p.shape[1])
     reactive = _integers(source.series[row, LOAD_Q], step + horizon, hidden.load_q.shape[1])
     production = _integers(source.series[row, PROD_P], step + horizon, hidden.new_p.shape[1])
-    place = source.month_row[row] + step
-    later = min(place // MONTH_STEPS, source.last_month[row] - source.month[row])
+    later, place = month_and_row(source.month_row[row] + step, source.n_months[row])
     forecast_row(
-        _open_forecast_model(source.forecast[row, LOAD_P]),
+        source.forecast[row, LOAD_P],
         source.year[row],
         source.month[row] + later,
-        place - later * MONTH_STEPS,
+        place,
         horizon,
         active,
         reactive,
@@ -137,13 +133,13 @@ def _integers(address: int, row: int, size: int) -> I16:
 
 @jit
 def _integer(address: int, index: int) -> np.int16:
-    value: np.int16 = int16_at(np.int64(address), np.int64(index))  # type: ignore[call-arg]
+    value: np.int16 = int16_at(np.int64(address), np.int64(index))
     return value
 
 
 @jit
 def _value(address: int, index: int) -> np.float32:
-    value: np.float32 = float32_at(np.int64(address), np.int64(index))  # type: ignore[call-arg]
+    value: np.float32 = float32_at(np.int64(address), np.int64(index))
     return value
 
 

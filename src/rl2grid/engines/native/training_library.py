@@ -15,6 +15,7 @@ from rl2grid.handles import Handle
 from rl2grid.scenarios.cache import data_folder
 from rl2grid.scenarios.generator.calendar import MONTH_STEPS, month_start
 from rl2grid.scenarios.generator.constants import load_constants
+from rl2grid.scenarios.making import make_library_beside
 from rl2grid.scenarios.month_names import MONTHS, Months
 from rl2grid.scenarios.outage_draws import most_outages, outage_model
 from rl2grid.scenarios.splits import FIRST_TRAINING_SEED, TRAINING_YEARS
@@ -24,11 +25,14 @@ from rl2grid.scenarios.training_years import TrainingMonths, TrainingYear, forec
 class TrainingLibrary:
     """The years of a grid: those that somebody has played stay open for all engines of the process.
 
+    Idle processes begin to make what is missing (:func:`rl2grid.scenarios.making.make_library_beside`).
+
     Args:
         grid: the grid, whose system has constants of the generator.
     """
 
     def __init__(self, grid: Grid) -> None:
+        make_library_beside(grid)
         self._grid = grid
         self._lock = threading.Lock()
         forecasts = forecasts_of(grid)

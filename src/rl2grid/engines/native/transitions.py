@@ -31,6 +31,7 @@ from rl2grid.engines.native.beginning import Draws
 from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.engines.native.entry import reset_rows
 from rl2grid.engines.native.threads import Threads
+from rl2grid.engines.native.training_library import training_library
 from rl2grid.engines.transition import Transitions
 from rl2grid.grids import Grid
 from rl2grid.mdp.actions import (
@@ -259,15 +260,16 @@ class NativeTransitions(Transitions):
         Raises:
             UsageError: the data folder cannot be written, or has no room for the library; nothing has begun then.
         """
-        draws = self.engine.draw_training(seeds, numbers)
+        library = training_library(self.engine.grid)
+        draws = self.engine.draw_training(library, seeds, numbers)
 
         def show(thread: int, part: slice) -> None:
             own = Draws(*(column[part] for column in draws))
-            self.engine.show_training(thread, rows[part], own, maintained)
+            self.engine.show_training(library, thread, rows[part], own, maintained)
 
         self._in_threads(show, len(rows), num_threads)
         self._advance(rows, self._nothing[: len(rows)], num_threads, True)
-        plans = self.engine.take_training(rows, draws, maintained)
+        plans = self.engine.take_training(library, rows, draws, maintained)
         for i in rows.tolist():
             self.action_effects[i] = ""
         return plans

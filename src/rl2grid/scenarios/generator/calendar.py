@@ -31,6 +31,16 @@ def day_kinds(year: int, days: int) -> I64:
 
 
 @jit
+def month_and_row(row: int, n_months: int) -> tuple[int, int]:
+    """Which of ``n_months`` months in a row a row belongs to, and which row of that month it is.
+
+    The last row of a month is the first of the next one, where there is a next one.
+    """
+    month = min(row // MONTH_STEPS, n_months - 1)
+    return month, row - month * MONTH_STEPS
+
+
+@jit
 def seasonal(knots: F64, row: int) -> float:
     """Value at ``row`` of what is known in the middle of each of the 12 calendar months."""
     position = row * (12.0 / (365.0 * 288.0)) + 11.5

@@ -14,6 +14,7 @@ import numpy as np
 from rl2grid.arrays import F32, F64, I16, I64
 from rl2grid.compile import jit
 from rl2grid.grids import Grid
+from rl2grid.handles import opener
 from rl2grid.philox import fill_uniforms, stream_key
 from rl2grid.scenarios.generator.arithmetic import rounded, to_gaussian
 from rl2grid.scenarios.generator.constants import Constants
@@ -41,6 +42,9 @@ class ForecastModel(NamedTuple):
     spread: Annotated[F64, constant("gen", "the same of wind and sun; 0: follows its schedule")]
     renewables: Annotated[I64, constant("1", "how many of wind and sun there are")]
     pmax: Annotated[F64, constant("gen", "no more is forecast", "0.1 MW")]
+
+
+_open_model = opener(ForecastModel)
 
 
 def forecast_model(grid: Grid, constants: Constants) -> ForecastModel:
@@ -85,7 +89,7 @@ def make_forecasts(
 
 @jit
 def forecast_row(
-    model: ForecastModel,
+    address: int,
     seed: int,
     month: int,
     row: int,
@@ -100,7 +104,7 @@ def forecast_row(
     """What row ``row`` of a month forecasts for ``steps`` steps later.
 
     Args:
-        model: of the grid.
+        address: of the handle to the grid's :class:`ForecastModel`.
         seed: seed of the year.
         month: 0 .. 11.
         row: of the month.
@@ -112,6 +116,7 @@ def forecast_row(
         load_q: output, MVAr, float32 [load].
         prod_p: output, MW, float32 [gen].
     """
+    model = _open_model(address)
     before = row * model.horizon[0]
     noise = np.empty((steps, active.size))
     fill_uniforms(seed, stream_key(channel_key(0, _LOADS, month), _SERIES), before * active.size, noise.reshape(-1))
