@@ -10,19 +10,21 @@ import rl2grid  # noqa: F401  (registers the tasks)
 from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.engines.native.training_library import training_library
 from rl2grid.grids import GRID_IDS, Grid, load_grid
-from rl2grid.scenarios.episodes import EpisodePlan, plan_episode
+from rl2grid.scenarios.episodes import MAX_STEPS, EpisodePlan, plan_episode
 from rl2grid.structures import Role, fields_of
 
 N = 12
 _DRAWN = ("waits", "durations", "choices")
 
 
-def begun(grid: Grid, seeds: np.ndarray, numbers: np.ndarray, maintained: bool) -> tuple[NativeEngine, list[Any]]:
+def begun(
+    grid: Grid, seeds: np.ndarray, numbers: np.ndarray, maintained: bool, n_steps: int = MAX_STEPS
+) -> tuple[NativeEngine, list[Any]]:
     engine, rows = NativeEngine(grid, len(seeds)), np.arange(len(seeds))
     library = training_library(grid)
     draws = engine.draw_training(library, seeds, numbers)
-    engine.show_training(library, 0, rows, draws, maintained)
-    return engine, engine.take_training(library, rows, draws, maintained)
+    engine.show_training(library, 0, rows, draws, maintained, n_steps)
+    return engine, engine.take_training(library, rows, draws, maintained, n_steps)
 
 
 def assert_same(first: NativeEngine, second: NativeEngine) -> None:
@@ -55,6 +57,18 @@ def test_an_episode_is_what_is_planned_of_it(grid_id: str, maintained: bool) -> 
     assert_same(engine, other)
     assert not maintained or (engine.environments.hidden.outage_count > 0).any() or "bus36" in grid_id
     assert [engine.save(i).series for i in range(N)] == [other.save(i).series for i in range(N)]
+
+
+def test_a_week_is_begun_as_it_is_planned() -> None:
+    """On the grid whose opponent draws until the end of the episode."""
+    grid, seeds = load_grid("bus36-MO-v1"), np.arange(N)
+    engine, plans = begun(grid, seeds, np.zeros(N, np.int64), True, 2016)
+    other = NativeEngine(grid, N)
+    assert plans == [plan_episode(grid, "train", seed, 0, episode_length=2016) for seed in range(N)]
+    for i, plan in enumerate(plans):
+        other.reset(i, plan)
+    assert_same(engine, other)
+    assert (engine.state.episode_length == 2016).all()
 
 
 def test_rows_that_are_overloaded_or_under_maintenance_are_judged_alike() -> None:

@@ -19,6 +19,7 @@ from rl2grid.envs.options import OPTION_NAMES, TaskOptions, changed_options, opt
 from rl2grid.envs.tasks import find_task
 from rl2grid.envs.vector import PowerGridVectorEnv
 from rl2grid.errors import UsageError
+from rl2grid.evaluation.flags import flag_of
 
 DEFAULTS = TaskOptions()
 
@@ -68,6 +69,12 @@ def test_values_of_another_kind_are_refused(name: str, value: Any):
         TaskOptions(**{name: value})
 
 
+@pytest.mark.parametrize("length", [0, -1, 8065, 1.5, True, "2016"])
+def test_lengths_that_no_episode_can_have_are_refused(length: Any):
+    with pytest.raises(UsageError, match="is not allowed: give a number of grid steps from 1 to 8064, or None"):
+        TaskOptions(episode_length=length)
+
+
 def test_every_keyword_says_what_it_means():
     texts = option_texts()
     assert tuple(texts) == OPTION_NAMES
@@ -86,6 +93,8 @@ def test_flags_follow_from_the_declaration(capsys: pytest.CaptureFixture[str]):
         "--reward",
         "1,2,0",
         "--no-opponent",
+        "--episode-length",
+        "2016",
         "--normalize",
         "None",
     ]
@@ -95,8 +104,12 @@ def test_flags_follow_from_the_declaration(capsys: pytest.CaptureFixture[str]):
         "reward": (1.0, 2.0, 0.0),
         "normalize": None,
         "opponent": False,
+        "episode_length": 2016,
     }
     assert keywords.given(parser.parse_args([])) == {}
+    assert keywords.given(parser.parse_args(["--episode-length", "None"])) == {"episode_length": None}
+    with pytest.raises(UsageError, match=r"^--episode-length week is not allowed: give a whole number, or None"):
+        keywords.given(parser.parse_args(["--episode-length", "week"]))
     with pytest.raises(SystemExit):
         parser.parse_args(["--dispatch", "fast"])
     assert "exact" in capsys.readouterr().err
@@ -107,7 +120,7 @@ def test_help_shows_every_keyword_that_is_a_flag(command: list[str], capsys: pyt
     with pytest.raises(SystemExit):
         main(command)
     shown = capsys.readouterr().out
-    assert all(f"--{name}" in shown for name in keywords.NAMES)
+    assert all(f"--{flag_of(name)}" in shown for name in keywords.NAMES)
 
 
 def test_an_opponent_that_the_grid_has_not_is_refused_when_asked_for():

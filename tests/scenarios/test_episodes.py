@@ -174,3 +174,18 @@ def test_only_drawn_starts_of_generated_months_are_drawn_again(monkeypatch) -> N
     assert plan_episode(BUS14, "train", 0, 0, start=plan.start).redraws == 0
     assert plan_episode(BUS14, "bundled", 0, 0).redraws == 0
     assert episodes._draw_start(BUS14, load_scenario("bus14", "bundled/0000"), 0, 0).redraws == 0
+
+
+def test_an_episode_of_a_given_length_fits_where_it_starts() -> None:
+    for seed in range(20):
+        default, week = (plan_episode(BUS14, "train", seed, 1, episode_length=length) for length in (None, 2016))
+        assert week == replace(default, n_steps=2016)
+    assert plan_episode(BUS14, "bundled", 0, 0, episode_length=575).n_steps == 575
+    assert admissible_starts(575, 500) == 76
+
+
+@pytest.mark.parametrize(("start", "steps"), [(None, 575), (100, 475)])
+def test_a_length_that_the_series_does_not_have_is_refused(start: int | None, steps: int) -> None:
+    sentence = rf"^episode_length={steps + 1} is longer than scenario bundled/0000, which has {steps} steps from row "
+    with pytest.raises(UsageError, match=sentence):
+        plan_episode(BUS14, "bundled", 0, 0, scenario="bundled/0000", start=start, episode_length=steps + 1)

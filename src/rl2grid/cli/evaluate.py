@@ -66,7 +66,9 @@ def _run(options: argparse.Namespace, output: Output) -> int:
     results = [_evaluated(agent, one, task, options, output) for agent, one in zip(agents, made, strict=True)]
     summaries = [result.summary for result in results]
     records = [asdict(result.summary) | {"foresight": result.foresight, "folder": result.folder} for result in results]
-    output.table(summary_table(summaries), records, title=f"{task.id}, {options.split} scenarios")
+    length = results[0].identity.get("episode_length")
+    of_length = "" if length is None else f", episodes of {length} steps"
+    output.table(summary_table(summaries), records, title=f"{task.id}, {options.split} scenarios{of_length}")
     for result in results:
         if result.foresight:
             output.remark(

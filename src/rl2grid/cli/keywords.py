@@ -6,6 +6,8 @@ import argparse
 from typing import Any
 
 from rl2grid.envs.options import option_texts, options_without
+from rl2grid.errors import UsageError
+from rl2grid.evaluation.flags import flag_of
 from rl2grid.mdp.rewards import resolve_reward
 
 GIVEN_OTHERWISE = ("split", "scenario", "gamma")
@@ -32,7 +34,10 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         if isinstance(option.default, bool):
             how = {"action": argparse.BooleanOptionalAction}
         group.add_argument(
-            f"--{option.name}", default=argparse.SUPPRESS, help=flag_text(option.name).replace("%", "%%"), **how
+            f"--{flag_of(option.name)}",
+            default=argparse.SUPPRESS,
+            help=flag_text(option.name).replace("%", "%%"),
+            **how,
         )
 
 
@@ -48,7 +53,16 @@ def given(options: argparse.Namespace) -> dict[str, Any]:
     keywords = {name: None if value == "None" else value for name, value in keywords.items()}
     if "reward" in keywords:
         keywords["reward"] = reward_of(keywords["reward"])
+    if keywords.get("episode_length") is not None:
+        keywords["episode_length"] = _whole_number("episode_length", keywords["episode_length"])
     return keywords
+
+
+def _whole_number(name: str, text: str) -> int:
+    try:
+        return int(text)
+    except ValueError:
+        raise UsageError(f"--{flag_of(name)} {text} is not allowed: give a whole number, or None.") from None
 
 
 def reward_of(text: str) -> str | tuple[float, ...]:

@@ -174,7 +174,7 @@ def _report(folder: Path, task: Task, limit: TimeLimit, output: Output) -> int:
 
 def _is_given(name: str, flags: list[str]) -> bool:
     """Whether a keyword of the environment stands among the flags, at its default or not."""
-    return any(flag.split("=", 1)[0].replace("_", "-") == f"--{name}" for flag in flags)
+    return any(flag.split("=", 1)[0].replace("_", "-") == f"--{flag_of(name)}" for flag in flags)
 
 
 def _preset(flags: list[str]) -> str:

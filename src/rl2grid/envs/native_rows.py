@@ -18,7 +18,7 @@ from rl2grid.envs.task_environments import StreamPosition
 from rl2grid.envs.tasks import Task
 from rl2grid.grids import find_system
 from rl2grid.mdp.actions import DO_NOTHING
-from rl2grid.scenarios.episodes import EpisodePlan
+from rl2grid.scenarios.episodes import MAX_STEPS, EpisodePlan
 from rl2grid.scenarios.months import GeneratedScenarios
 from rl2grid.scenarios.splits import TRAIN
 
@@ -62,6 +62,7 @@ class NativeRows(EngineRows[Commands]):
             np.array([position.number for position in positions], np.int64),
             self.options.maintenance,
             self._num_threads,
+            self.options.episode_length or MAX_STEPS,
         )
 
     def _plays_library(self, positions: list[StreamPosition]) -> bool:

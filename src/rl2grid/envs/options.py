@@ -15,6 +15,7 @@ from rl2grid.engines import DISPATCHES, ENGINES, HEURISTICS
 from rl2grid.envs.tasks import Task, constraint_of
 from rl2grid.errors import UsageError, one_of
 from rl2grid.mdp.constraint_table import CONSTRAINTS
+from rl2grid.scenarios.episodes import MAX_STEPS
 from rl2grid.scenarios.splits import SPLITS
 
 _LITERAL = re.compile(r'``"?(.*?)"?``')
@@ -29,6 +30,14 @@ def _one_of(*choices: str | None) -> dict[str, Any]:
 def _refuse_no_discount(value: object) -> None:
     if value is not None and not (isinstance(value, int | float) and 0 <= value <= 1):
         raise UsageError(f"gamma={value!r} is not allowed: give a discount between 0 and 1, or None.")
+
+
+def _refuse_no_length(value: object) -> None:
+    if value is None or (isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= MAX_STEPS):
+        return
+    raise UsageError(
+        f"episode_length={value!r} is not allowed: give a number of grid steps from 1 to {MAX_STEPS}, or None."
+    )
 
 
 @dataclass(frozen=True)
@@ -69,6 +78,8 @@ class TaskOptions:
     """Whether planned maintenance happens."""
     opponent: bool = True
     """Whether the grid's opponent attacks, if it has one."""
+    episode_length: int | None = field(default=None, metadata={"check": _refuse_no_length})
+    """Grid steps of a completed episode, such as 2016 for a week; None: 8064, or the series where it is shorter."""
 
     def __post_init__(self) -> None:
         for option in fields(self):

@@ -401,6 +401,7 @@ class TaskEnvironments:
             scenario=position.options.get("scenario", self.options.scenario),
             start=position.options.get("start"),
             maintenance=self.options.maintenance,
+            episode_length=self.options.episode_length,
         )
 
     def _observe(self, state: GridState, i: int, out: NDArray[np.float32]) -> None:

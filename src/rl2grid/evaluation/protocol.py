@@ -31,10 +31,12 @@ from rl2grid.records.evaluation_folder import open_store
 from rl2grid.records.evaluations import Evaluation, labels
 from rl2grid.records.files import check_folder, printable
 from rl2grid.records.versions import library_versions
+from rl2grid.scenarios.episodes import MAX_STEPS, check_length
 from rl2grid.scenarios.library import (
     check_in_split,
     generator_version,
     list_scenarios,
+    load_scenario,
     make_scenarios,
     scenario_pack_hash,
     split_version,
@@ -94,6 +96,7 @@ def evaluate(
     resolve_reward(keywords.get("reward", "default"))
     chosen_scenarios = _checked_scenarios(task, split, scenarios)
     jobs = _jobs(chosen_scenarios, seeds, start)
+    _check_lengths(task, chosen_scenarios, start, keywords.get("episode_length"))
     if output is not None:
         check_folder(output)  # before months are made, which takes minutes
     watch_making(task.grid_id, *make_scenarios(task.grid_id, chosen_scenarios), progress)
@@ -206,6 +209,18 @@ def _checked_scenarios(task: Task, split: str, scenarios: Sequence[str] | None) 
     for scenario in scenarios:
         check_in_split(task.grid_id, split, scenario)
     return tuple(scenarios)
+
+
+def _check_lengths(task: Task, scenarios: Sequence[str], start: int, episode_length: int | None) -> None:
+    """Refuse an episode that does not fit into some scenario, before anything is played."""
+    if episode_length is None:
+        return
+    for scenario in scenarios:
+        # A generated month has as many steps as an episode at most, and need not be made to know it.
+        whole = scenario.startswith("generated/") and "[" not in scenario
+        check_length(
+            scenario, MAX_STEPS if whole else load_scenario(task.grid_id, scenario).n_steps, episode_length, start
+        )
 
 
 def _jobs(scenarios: Sequence[str], seeds: Sequence[int], start: int) -> list[Job]:

@@ -82,7 +82,8 @@ def other_versions(identity: Mapping[str, Any]) -> str:
 def keywords_of(identity: Mapping[str, Any], name: str) -> dict[str, Any]:
     """Keywords of the environments of an evaluation."""
     try:
-        keywords = {key: identity[key] for key in _KEYWORDS}
+        # What names no length was played at the default one.
+        keywords = {key: {"episode_length": None, **identity}[key] for key in _KEYWORDS}
     except KeyError as error:
         raise UsageError(f"{name} cannot be played: its identity has no {error.args[0]}.") from None
     reward = keywords["reward"]

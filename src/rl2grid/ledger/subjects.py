@@ -123,6 +123,11 @@ def _test_of(task: Task, months: int | None) -> dict[str, Any]:
     return {"split_version": split_version(task.grid_id, TEST), "months": number}
 
 
+def _frozen(keywords: Mapping[str, Any]) -> dict[str, Any]:
+    """The keywords of a training; ``episode_length`` only where it was given: others are called as they were before."""
+    return {name: value for name, value in keywords.items() if name != "episode_length" or value is not None}
+
+
 def _untrained(agent: str, task: Task, heuristic: str | None, months: int | None) -> Subject:
     configuration = {"agent": agent, "task": task.id, "heuristic": heuristic, "test": _test_of(task, months)}
     return Subject(configuration, agent, task, heuristic, {})
@@ -143,7 +148,7 @@ def _trained(folder: Path, months: int | None) -> Subject:
         "algorithm": args.algorithm,
         "task": args.task.id,
         "hyperparameters": identifying(args.hyperparameters),
-        "env_keywords": dict(args.env_keywords),
+        "env_keywords": _frozen(args.env_keywords),
         "targets_version": identity.get("targets_version", 1),
         "test": _test_of(args.task, months),
     }

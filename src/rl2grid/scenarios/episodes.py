@@ -64,6 +64,7 @@ def plan_episode(
     scenario: str | None = None,
     start: int | None = None,
     maintenance: bool = True,
+    episode_length: int | None = None,
 ) -> EpisodePlan:
     """Decide episode ``number`` of the stream of episodes of ``seed``.
 
@@ -73,8 +74,19 @@ def plan_episode(
     are enumerated: episode ``number`` of seed ``seed`` plays scenario ``seed + number`` of the list (beginning again at
     its end) from row 0. ``scenario`` and ``start`` replace what would be drawn and leave every other draw as it was.
 
+    Args:
+        grid: the grid.
+        split: of the scenarios.
+        seed: of the stream of episodes.
+        number: episodes of the stream before this one.
+        scenario: id; None: drawn, or the next one of the list.
+        start: row that the reset shows; None: drawn in training, else 0.
+        maintenance: whether planned outages happen.
+        episode_length: steps of the completed episode; None: as many as there are, up to :data:`MAX_STEPS`.
+
     Raises:
-        UsageError: ``split`` is unknown, ``scenario`` is not in it, or ``start`` leaves nothing to play.
+        UsageError: ``split`` is unknown, ``scenario`` is not in it, ``start`` leaves nothing to play, or the scenario
+            has fewer steps than ``episode_length``.
     """
     if scenario is not None:
         check_in_split(grid.id, split, scenario)
@@ -83,15 +95,40 @@ def plan_episode(
     series = open_series(grid.id, scenario)
     redraws = 0
     if start is None:
-        start, redraws = _draw_start(grid, series, seed, number) if split == TRAIN else _Start(0, 0)
+        check_length(scenario, series.n_steps, episode_length)
+        is_drawn = split == TRAIN
+        start, redraws = _draw_start(grid, series, seed, number, episode_length) if is_drawn else _Start(0, 0)
     _check_start(start, scenario, series.n_steps)
-    n_steps = min(MAX_STEPS, series.n_steps - int(start))
+    check_length(scenario, series.n_steps, episode_length, int(start))
+    n_steps = min(MAX_STEPS, series.n_steps - int(start)) if episode_length is None else episode_length
     return EpisodePlan(seed, number, scenario, int(start), n_steps, maintenance, redraws)
 
 
-def admissible_starts(n_steps: int) -> int:
-    """Rows at which a training episode may start in a window of ``n_steps`` steps: 0 to this less one."""
-    return n_steps - min(MIN_TRAINING_STEPS, (n_steps + 1) // 2) + 1
+def admissible_starts(n_steps: int, episode_length: int | None = None) -> int:
+    """Rows at which a training episode may start in a window of ``n_steps`` steps: 0 to this less one.
+
+    An episode of a given length must fit.
+    """
+    return n_steps - (min(MIN_TRAINING_STEPS, (n_steps + 1) // 2) if episode_length is None else episode_length) + 1
+
+
+def check_length(scenario_id: str, n_steps: int, episode_length: int | None, start: int = 0) -> None:
+    """Refuse a scenario that is too short for an episode.
+
+    Args:
+        scenario_id: the scenario.
+        n_steps: that can be played from its row 0.
+        episode_length: steps of the completed episode; None: as many as there are.
+        start: row at which the episode begins.
+
+    Raises:
+        UsageError: it is too short.
+    """
+    if episode_length is not None and n_steps - start < episode_length:
+        raise UsageError(
+            f"episode_length={episode_length} is longer than scenario {scenario_id}, which has {n_steps - start} steps "
+            f"from row {start} on: give at most these, or None."
+        )
 
 
 def planned_outages(grid: Grid, scenario: Scenario | TrainingMonths, plan: EpisodePlan) -> NDArray[np.int32]:
@@ -122,8 +159,10 @@ def maintenance_matrix(grid: Grid, scenario: Scenario, plan: EpisodePlan) -> NDA
     return matrix_of(planned_outages(grid, scenario, plan), scenario.n_rows, grid.n_line)
 
 
-def _draw_start(grid: Grid, series: Scenario | TrainingMonths, seed: int, number: int) -> _Start:
-    starts = admissible_starts(series.n_steps)
+def _draw_start(
+    grid: Grid, series: Scenario | TrainingMonths, seed: int, number: int, episode_length: int | None = None
+) -> _Start:
+    starts = admissible_starts(series.n_steps, episode_length)
     stream = Stream(seed, number, Purpose.START)
     if series.source != "generated":
         return _Start(stream.integer(starts), 0)

@@ -83,7 +83,9 @@ def draw_months(few: I64, draws: Draws) -> None:
 
 
 @jit
-def begin_episodes(address: int, library: int, rows: I64, draws: Draws, maintained: bool, attacked: bool) -> None:
+def begin_episodes(
+    address: int, library: int, rows: I64, draws: Draws, maintained: bool, attacked: bool, n_steps: int
+) -> None:
     """Show the first row of a training episode in each of ``rows``.
 
     Args:
@@ -93,23 +95,24 @@ def begin_episodes(address: int, library: int, rows: I64, draws: Draws, maintain
         draws: what begins there.
         maintained: whether planned outages happen.
         attacked: whether the grid's opponent attacks.
+        n_steps: of a completed episode, at most :data:`~rl2grid.scenarios.episodes.MAX_STEPS`.
     """
     environments, years = open_environments(address), _open_library(library)
     for k in range(rows.shape[0]):
         i, seed, number = rows[k], draws.seed[k], draws.number[k]
-        _hand_out(environments, i)
+        _hand_out(environments, i, n_steps)
         if attacked:
-            draw_attacks(environments.opponent, i, seed, stream_key(number, _OPPONENT), MAX_STEPS)
+            draw_attacks(environments.opponent, i, seed, stream_key(number, _OPPONENT), n_steps)
         draws.redraws[k] = _find_start(environments, years, i, k, draws, maintained)
         draws.start[k] = environments.hidden.month_row[i]
 
 
 @jit
-def _hand_out(environments: Environments, i: int) -> None:
+def _hand_out(environments: Environments, i: int, n_steps: int) -> None:
     """An episode in row ``i`` of which nothing was played."""
     state = environments.state
     state.step[i] = 0
-    state.episode_length[i] = MAX_STEPS
+    state.episode_length[i] = n_steps
     state.decisions[i] = 0
     state.truncated[i] = False
     state.illegal[i] = False

@@ -149,11 +149,21 @@ class NativeEngine:
         self._make_room(library.most_outages)
         return draws
 
-    def show_training(self, library: TrainingLibrary, thread: int, rows: I64, draws: Draws, maintained: bool) -> None:
+    def show_training(
+        self,
+        library: TrainingLibrary,
+        thread: int,
+        rows: I64,
+        draws: Draws,
+        maintained: bool,
+        n_steps: int = MAX_STEPS,
+    ) -> None:
         """Show the first rows of the episodes that were drawn, in ``rows``; threads may show different ones."""
-        begin_episodes(self.address_for(thread), library.address, rows, draws, maintained, self._attacks)
+        begin_episodes(self.address_for(thread), library.address, rows, draws, maintained, self._attacks, n_steps)
 
-    def take_training(self, library: TrainingLibrary, rows: I64, draws: Draws, maintained: bool) -> list[EpisodePlan]:
+    def take_training(
+        self, library: TrainingLibrary, rows: I64, draws: Draws, maintained: bool, n_steps: int = MAX_STEPS
+    ) -> list[EpisodePlan]:
         """Note what was begun in ``rows``; returns the plans of the episodes."""
         hidden, plans = self.environments.hidden, []
         for i, seed, number, year, month, start, redraws in zip(
@@ -162,7 +172,7 @@ class NativeEngine:
             months = library.months(year, month)
             name = SeriesName(months.id, months.content_hash, start)
             self._playing[i] = self._true[i] = Playing(name, months, hidden.series[i].copy(), hidden.forecast[i].copy())
-            plans.append(EpisodePlan(seed, number, months.id, start, MAX_STEPS, maintained, redraws))
+            plans.append(EpisodePlan(seed, number, months.id, start, n_steps, maintained, redraws))
         return plans
 
     def step(self, i: int, action: StepAction) -> None:

@@ -46,7 +46,7 @@ from rl2grid.mdp.actions import (
     write_mask,
 )
 from rl2grid.mdp.rewards import default_components, paper_components, released_components
-from rl2grid.scenarios.episodes import EpisodePlan
+from rl2grid.scenarios.episodes import MAX_STEPS, EpisodePlan
 
 _COMPILED_IN: dict[Callable[..., Any], int] = {
     default_components: DEFAULT,
@@ -251,11 +251,18 @@ class NativeTransitions(Transitions):
         self._advance(rows, self._nothing[: len(rows)], num_threads, True)
 
     def begin_training(
-        self, rows: I64, seeds: I64, numbers: I64, maintained: bool, num_threads: int
+        self,
+        rows: I64,
+        seeds: I64,
+        numbers: I64,
+        maintained: bool,
+        num_threads: int,
+        n_steps: int = MAX_STEPS,
     ) -> list[EpisodePlan]:
         """Begin the training episodes ``numbers`` of ``seeds`` in ``rows`` and play to their first decisions.
 
-        What is begun is what :func:`~rl2grid.scenarios.episodes.plan_episode` plans of the library of training years.
+        What is begun is what :func:`~rl2grid.scenarios.episodes.plan_episode` plans of the library of training years;
+        it is completed after ``n_steps`` steps.
 
         Raises:
             UsageError: the data folder cannot be written, or has no room for the library; nothing has begun then.
@@ -265,11 +272,11 @@ class NativeTransitions(Transitions):
 
         def show(thread: int, part: slice) -> None:
             own = Draws(*(column[part] for column in draws))
-            self.engine.show_training(library, thread, rows[part], own, maintained)
+            self.engine.show_training(library, thread, rows[part], own, maintained, n_steps)
 
         self._in_threads(show, len(rows), num_threads)
         self._advance(rows, self._nothing[: len(rows)], num_threads, True)
-        plans = self.engine.take_training(library, rows, draws, maintained)
+        plans = self.engine.take_training(library, rows, draws, maintained, n_steps)
         for i in rows.tolist():
             self.action_effects[i] = ""
         return plans
