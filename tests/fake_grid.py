@@ -17,6 +17,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from rl2grid.envs.operation import Operation
 from rl2grid.errors import UsageError
 from rl2grid.mdp.termination import GameOver
 
@@ -55,6 +56,9 @@ class FakeGrid(gymnasium.Env[Any, Any]):
 
     def action_masks(self) -> np.ndarray[Any, Any]:
         return np.array([True, True, self._stress < 0.3, False])
+
+    def operation(self) -> Operation:
+        return Operation(2.0 * self._step, 0.0, 0.0, 0.0, 100.0 * (LENGTH - self._step) * self._lost(), 0.0, 0.0, 0.0)
 
     def clock_at(self, step: int) -> datetime:
         return datetime(2020, 4, 1) + step * timedelta(minutes=5)

@@ -11,7 +11,7 @@ import pytest
 from rl2grid.cli.main import main
 from rl2grid.evaluation.protocol import evaluate
 from rl2grid.records.entries import episode_hash
-from rl2grid.records.episodes import FACTS
+from rl2grid.records.episodes import FACTS, OPERATION
 
 MONTH = "generated/710000-00"
 
@@ -26,7 +26,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     contents = json.loads((folder / "random.json").read_text())
     (episode,) = contents["episodes"]
     episode["survival"] = 0.999
-    episode["hash"] = episode_hash({column.name: episode[column.name] for column in FACTS})
+    episode["hash"] = episode_hash({column.name: episode[column.name] for column in (*FACTS, *OPERATION)})
     del contents["checksum"]
     (folder / "forged.json").write_text(json.dumps(contents))
     return folder

@@ -93,6 +93,19 @@ def test_seed_decides_the_episode(plain):
     np.testing.assert_array_equal(following, plain.reset()[0])
 
 
+def test_an_episode_of_a_given_length_is_completed_there(engine):
+    keywords = {"engine": engine, "split": "bundled", "heuristic": "idle", "maintenance": False}
+    with make("bus14-T0", episode_length=30, **keywords) as environment:
+        _, info = environment.reset(seed=0)
+        _, _, terminated, truncated, info = environment.step(0)
+        assert (info["episode_length"], info["step"], info["survival"]) == (30, 30, 1.0)
+        assert (terminated, truncated) == (False, True)
+        spent = environment.unwrapped.operation()
+        assert spent.cost_losses > 0
+        assert spent.cost_blackout == 0
+        assert spent.renewable_used == pytest.approx(spent.renewable_available, rel=1e-6)
+
+
 def test_training_begins_at_random_rows_and_evaluation_at_row_zero(engine):
     with make("bus14-T0", engine=engine) as environment:
         starts = {environment.reset(seed=seed)[1]["start"] for seed in range(5)}

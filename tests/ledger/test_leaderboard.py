@@ -20,7 +20,7 @@ from rl2grid.evaluation.protocol import evaluate
 from rl2grid.ledger.making import find_evaluation, make_entry
 from rl2grid.ledger.verification import check_entry, verify_entry
 from rl2grid.records.entries import episode_hash, read_entry, write_entry
-from rl2grid.records.episodes import FACTS
+from rl2grid.records.episodes import FACTS, OPERATION
 from rl2grid.records.evaluations import identity_hash
 
 MONTHS = ["generated/710000-00", "generated/710003-09"]
@@ -56,7 +56,7 @@ def rehash(contents: Contents) -> None:
     """What a careful forger would do after a change."""
     contents["identity_hash"] = identity_hash(contents["identity"])
     for episode in contents["episodes"]:
-        episode["hash"] = episode_hash({column.name: episode[column.name] for column in FACTS})
+        episode["hash"] = episode_hash({column.name: episode[column.name] for column in (*FACTS, *OPERATION)})
 
 
 def unpack(episode: Contents) -> Any:

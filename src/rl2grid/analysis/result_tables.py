@@ -6,6 +6,7 @@ import itertools
 from collections.abc import Iterable, Mapping, Sequence
 
 from rl2grid.analysis.comparison_table import comparison_table, pair_cells, pairwise
+from rl2grid.analysis.l2rpn_table import l2rpn_table, operation_table, stored_scores
 from rl2grid.analysis.table import (
     MISSING,
     Cell,
@@ -54,6 +55,8 @@ def result_tables(methods: Methods) -> tuple[ResultTable, ...]:
     if len(methods) > 1 and any(len(group) > 1 for group in methods.values()):
         tables.insert(0, overview_table(methods))
     tables += [aggregate_table(methods), constraint_table(methods), score_table(methods), ending_table(methods)]
+    found = operation_table(methods), l2rpn_table(methods, stored_scores(methods))
+    tables += [table for table in found if table is not None]
     if any(len(group) > 1 for group in methods.values()):
         tables.append(comparison_table(methods))
     return tuple(tables)
@@ -121,6 +124,8 @@ def _ranking_table(
         "on the same months; p: that there is none, Holm's correction over all pairs of methods. Others: shares of "
         f"episodes. Safe: completed, and cost {kept}. Played: training runs x months x seeds. {interval_words(ranked)}."
     )
+    length = ranked[0].evaluations[0].identity.get("episode_length")
+    caption += f" Episodes of {length:,} steps." if length is not None else ""
     columns = (*name_columns, *(Column(heading) for heading in headings))
     return ResultTable(f"ranking-{_task_name(ranked[0])}", caption, columns, tuple(rows))
 

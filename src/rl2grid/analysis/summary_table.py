@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from rl2grid.analysis.table import Cell, Column, ResultTable, markdown_row, share_text, with_interval
@@ -23,6 +24,7 @@ HEADINGS: tuple[str, ...] = (
     "margin",
     "overload",
     "topology",
+    "operating cost",
 )
 N_LABELS = 2
 """Leading columns that hold words."""
@@ -31,7 +33,8 @@ LEGEND = (
     "Means per episode with 95% intervals over months alone: one policy says nothing of other trainings. Survival: "
     "share of the episode survived; "
     "IQM: interquartile mean. Safe: cost within the threshold and episode completed. "
-    "Margin, overload, topology: the operational scores, means per step."
+    "Margin, overload, topology: the operational scores, means per step. Operating cost: losses, redispatch, "
+    "curtailment, storage and blackout at the prices of L2RPN 2020."
 )
 
 
@@ -52,6 +55,7 @@ def table_cells(summary: Summary) -> list[str]:
         _number(summary.score_margin),
         _number(summary.score_overload),
         _number(summary.score_topology),
+        _number(summary.cost_operation),
     ]
 
 
@@ -107,6 +111,8 @@ def is_best(summary: Summary, summaries: Sequence[Summary]) -> bool:
 def _number(estimate: Estimate) -> str:
     """Three significant digits, thousands separated."""
     value = estimate.value
+    if math.isnan(value):
+        return "-"
     if value == 0:
         return "0"
     if abs(value) >= 1000:

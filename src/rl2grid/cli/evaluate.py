@@ -15,6 +15,7 @@ from rl2grid.analysis.summary_table import summary_table
 from rl2grid.analysis.table import table_records
 from rl2grid.cli import keywords
 from rl2grid.cli.output import Output
+from rl2grid.cli.scoring import scored_table
 from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import make_agent
@@ -23,7 +24,7 @@ from rl2grid.evaluation.own_agents import is_own
 from rl2grid.evaluation.protocol import evaluate, first_months
 from rl2grid.records.collection import LAST_POLICY
 from rl2grid.records.evaluations import Evaluation
-from rl2grid.records.methods import group_methods
+from rl2grid.records.methods import Method, group_methods
 from rl2grid.scenarios.splits import SPLITS, TEST
 
 
@@ -49,6 +50,11 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         help="processes; by default this one for few native episodes, or one per core",
     )
     parser.add_argument("--output", type=Path, default=None, help="folder of the results of one agent")
+    parser.add_argument(
+        "--l2rpn",
+        action="store_true",
+        help="also the scores of the L2RPN competitions, for which two baselines are played",
+    )
     parser.set_defaults(run=_run)
 
 
@@ -74,6 +80,9 @@ def _run(options: argparse.Namespace, output: Output) -> int:
             output.remark(
                 f"{result.summary.agent} stepped saved true worlds: with this foresight it is not ranked with others."
             )
+    if options.l2rpn:
+        table = scored_table([Method((result,)) for result in results], output)
+        output.table(table, table_records(table), title="Scores of the L2RPN competitions")
     if len(results) > 1:
         _compare(results, output)
     if options.split == TEST:

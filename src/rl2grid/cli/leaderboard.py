@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rl2grid.cli.output import Output
+from rl2grid.cli.scoring import scored_table
 from rl2grid.envs.tasks import find_task
 from rl2grid.errors import UsageError
 from rl2grid.records.entries import PlayableEntry, read_entry, write_entry
@@ -74,6 +74,11 @@ def _add_table(actions: Any) -> None:
     parser.add_argument(
         "--to", default=None, metavar="NAME", help="of a ledger: what rows are compared with, as 'greedy + recovery'"
     )
+    parser.add_argument(
+        "--l2rpn",
+        action="store_true",
+        help="also the scores of the L2RPN competitions, for which two baselines are played",
+    )
     parser.set_defaults(run=_table)
 
 
@@ -86,7 +91,7 @@ def _entry(options: argparse.Namespace, output: Output) -> int:
         raise UsageError(f"Folder {options.output.parent} of the output does not exist.")
     if options.output.exists():
         raise UsageError(f"{options.output} exists already: remove it, or give another name as --output.")
-    with _playing(output, "Playing", len(load_evaluation(folder).episodes)) as show:
+    with output.counting("Playing", len(load_evaluation(folder).episodes)) as show:
         entry = make_entry(folder, agent=options.agent, label=options.label, on_progress=show)
     write_entry(options.output, entry)
     decisions = sum(len(episode.actions) for episode in entry.episodes)
@@ -141,7 +146,7 @@ def _verify_entries(paths: Sequence[Path], output: Output) -> int:
         check_entry(entry, str(path))
     found: dict[str, str | None] = {}
     for path, entry in entries.items():
-        with _playing(output, f"Playing {path.name}", len(entry.episodes)) as show:
+        with output.counting(f"Playing {path.name}", len(entry.episodes)) as show:
             difference = found[str(path)] = verify_entry(entry, show)
         if difference:
             print(f"rl2grid: {path} is not verified: {difference}.", file=sys.stderr)
@@ -178,10 +183,14 @@ def _table(options: argparse.Namespace, output: Output) -> int:
         check_comparable(list(results.values()))
     records: dict[str, list[dict[str, object]]] = {}
     for task, evaluations in by_task.items():
-        table = entry_table({str(path): Method((result,)) for path, result in evaluations.items()})
+        methods = {str(path): Method((result,)) for path, result in evaluations.items()}
+        table = entry_table(methods)
         records[task] = table_records(table)
         if not output.json:
             output.table(table, title=task.removeprefix("rl2grid/"))
+        if options.l2rpn:
+            scores = scored_table(list(methods.values()), output)
+            output.table(scores, table_records(scores), title=f"{task.removeprefix('rl2grid/')}, scores of L2RPN")
     output.results(entries=records)
     output.remark("As stored: 'rl2grid leaderboard verify' plays the actions again.")
     return 0
@@ -200,14 +209,3 @@ def _read(paths: Sequence[Path]) -> dict[Path, PlayableEntry]:
             raise UsageError(f"{path} was given twice: leave one out.")
         entries[path] = read_entry(path)
     return entries
-
-
-@contextmanager
-def _playing(output: Output, words: str, episodes: int) -> Iterator[Callable[[float], None]]:
-    """A progress bar, to be told how many episodes were played."""
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with output.progress(*columns, transient=True) as bar:
-        task = bar.add_task(words, total=episodes)
-        yield lambda played: bar.update(task, completed=played)

@@ -7,7 +7,8 @@ import math
 import os
 import shutil
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -85,6 +86,16 @@ class Output:
         from rich.progress import Progress
 
         return Progress(*columns, console=Console(stderr=True), transient=transient, disable=not self.talks)
+
+    @contextmanager
+    def counting(self, words: str, total: int) -> Iterator[Callable[[float], None]]:
+        """A progress bar, to be told how many of ``total`` are done."""
+        from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+        with self.progress(*columns, transient=True) as bar:
+            task = bar.add_task(words, total=total)
+            yield lambda done: bar.update(task, completed=done)
 
     def close(self) -> None:
         """Print what ``--json`` asked for."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from rl2grid.engines.worlds import World
 from rl2grid.envs.description import TaskDescription, single_spaces
+from rl2grid.envs.operation import Operation
 from rl2grid.envs.task_environments import SimulationResult, TaskEnvironments
 from rl2grid.mdp.state import GridState
 from rl2grid.structures import row_of
@@ -99,6 +100,14 @@ class RowMethods(TaskDescription):
             UsageError: no episode in progress, or the reference engine.
         """
         return self._environments.n_minus_1_score(self._i)
+
+    def operation(self) -> Operation:
+        """What the episode has cost so far, as the L2RPN competitions count it.
+
+        Raises:
+            UsageError: the environment was not reset yet.
+        """
+        return self._environments.operation(self._i)
 
     @property
     def imagined(self) -> bool:

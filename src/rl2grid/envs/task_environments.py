@@ -17,6 +17,7 @@ from rl2grid.engines.transition import Listener, Transitions
 from rl2grid.engines.worlds import Standing, Trail, World
 from rl2grid.envs.description import action_number
 from rl2grid.envs.info import episode_info
+from rl2grid.envs.operation import Operation, operation_of
 from rl2grid.envs.options import TaskOptions
 from rl2grid.envs.tasks import Task
 from rl2grid.errors import UsageError
@@ -363,6 +364,17 @@ class TaskEnvironments:
         """After a step: note how far the truth has been seen."""
         for i, trail in self._trails.items():
             trail.furthest = max(trail.furthest, int(self.state.step[i]))
+
+    def operation(self, i: int) -> Operation:
+        """What the episode of row ``i`` has cost so far.
+
+        Raises:
+            UsageError: the environment was not reset yet.
+        """
+        self._position(i)
+        plan = self._plans[i]
+        assert plan is not None
+        return operation_of(self.state, i, self.grid.id, plan)
 
     def close(self) -> None:
         self.engine.close()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 import zlib
 from collections.abc import Callable
+from dataclasses import asdict
 from typing import Any
 
 import gymnasium
@@ -103,6 +104,7 @@ def play_episode(
         last_overloads=ending.last_overloads,
         last_outages=ending.last_outages,
         last_cut_off=ending.last_cut_off,
+        **asdict(played.operation()),
         **totals,
     )
 

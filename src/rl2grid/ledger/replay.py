@@ -67,8 +67,9 @@ def difference(stored: Episode, played: Episode) -> str:
     for name in ("survival", *then):
         if then[name] != now[name]:
             return f"its {name} is stored as {then[name]!r}, played again it is {now[name]!r}"
-    if episode_hash(then) != episode_hash(now):
-        return f"its hash is stored as {episode_hash(then)}, played again it is {episode_hash(now)}"
+    again = episode_hash({name: now[name] for name in then})
+    if episode_hash(then) != again:
+        return f"its hash is stored as {episode_hash(then)}, played again it is {again}"
     return ""
 
 

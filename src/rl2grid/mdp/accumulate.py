@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from rl2grid.compile import jit
 from rl2grid.mdp.constraints import step_costs, update_excused
+from rl2grid.mdp.operation import accrue_operation
 from rl2grid.mdp.scores import margin_score, overload_score, topology_score
 from rl2grid.mdp.state import (
     COST,
@@ -36,6 +37,8 @@ def begin_episode(state: GridState, i: int) -> None:
     state.episode_components[i] = 0.0
     state.episode_costs[i] = 0.0
     state.episode_scores[i] = 0.0
+    state.episode_operation[i] = 0.0
+    state.curtailed[i] = 0.0
     state.decisions[i] = 0
 
 
@@ -97,6 +100,7 @@ def accrue(
     state.episode_scores[i, MARGIN_SCORE] += margin_score(state, i)
     state.episode_scores[i, OVERLOAD_SCORE] += overload_score(state, i)
     state.episode_scores[i, TOPOLOGY_SCORE] += topology_score(state, i)
+    accrue_operation(state, i)
 
 
 @jit

@@ -74,12 +74,12 @@ def default_components(state: GridState, i: int) -> Components:
     """Components of the ``default`` reward in row ``i``: 1, and two in [-1, 0]; see the module."""
     if state.terminated[i]:
         return 0.0, 0.0, 0.0
-    stored = _total(state.storage_power[i])
-    power = max(_total(state.gen_p[i]) - _total(state.load_p[i]) - stored, 0.0)
-    power += _magnitude(state.actual_dispatch[i]) + _magnitude(state.storage_power[i])
+    stored = total(state.storage_power[i])
+    power = max(total(state.gen_p[i]) - total(state.load_p[i]) - stored, 0.0)
+    power += magnitude(state.actual_dispatch[i]) + magnitude(state.storage_power[i])
     power += _curtailed(state.gen_p_before_curtail[i], state.gen_p[i])
-    largest = 0.1 * _dearest(state.gen_cost_per_mw) * _total(state.gen_pmax)
-    cost = 0.0 - min(max(_marginal_cost(state.gen_p[i], state.gen_cost_per_mw) * power / largest, 0.0), 1.0)
+    largest = 0.1 * _dearest(state.gen_cost_per_mw) * total(state.gen_pmax)
+    cost = 0.0 - min(max(marginal_cost(state.gen_p[i], state.gen_cost_per_mw) * power / largest, 0.0), 1.0)
     return 1.0, overload_component(state, i), cost
 
 
@@ -103,9 +103,9 @@ def paper_components(state: GridState, i: int) -> Components:
         return 0.0, 0.0, 0.0
     survive = np.float64(state.step[i]) / np.float64(state.episode_length[i])
     overload = max(0.0 - _overloads_and_outages(state.rho[i], state.line_status[i]), -1.0)
-    power = _total(state.gen_p[i]) - _total(state.load_p[i])
-    power += _magnitude(state.actual_dispatch[i]) + _magnitude(state.storage_power[i])
-    cost = min(max(0.0 - _marginal_cost(state.gen_p[i], state.gen_cost_per_mw) * power, -1.0), 0.0)
+    power = total(state.gen_p[i]) - total(state.load_p[i])
+    power += magnitude(state.actual_dispatch[i]) + magnitude(state.storage_power[i])
+    cost = min(max(0.0 - marginal_cost(state.gen_p[i], state.gen_cost_per_mw) * power, -1.0), 0.0)
     return survive, overload, cost
 
 
@@ -117,10 +117,10 @@ def released_components(state: GridState, i: int) -> Components:
     if state.illegal[i] or state.ambiguous[i]:
         return 1.0, -5.0, -1.0
     overload = 0.0 - _overloads_and_outages(state.rho[i], state.line_status[i]) / (0.1 * state.rho.shape[1])
-    regret = _total(state.gen_p[i]) - _total(state.load_p[i]) + _magnitude(state.storage_power[i])
-    regret += 5.0 * _magnitude(state.actual_dispatch[i])
-    largest = 5.05 * _dearest(state.gen_cost_per_mw) * _total(state.gen_pmax)
-    return 1.0, overload, 0.0 - _marginal_cost(state.gen_p[i], state.gen_cost_per_mw) * regret / largest
+    regret = total(state.gen_p[i]) - total(state.load_p[i]) + magnitude(state.storage_power[i])
+    regret += 5.0 * magnitude(state.actual_dispatch[i])
+    largest = 5.05 * _dearest(state.gen_cost_per_mw) * total(state.gen_pmax)
+    return 1.0, overload, 0.0 - marginal_cost(state.gen_p[i], state.gen_cost_per_mw) * regret / largest
 
 
 PRESETS: dict[str, RewardFunction] = {
@@ -219,7 +219,7 @@ def _curtailed(gen_p_before_curtail: F32, gen_p: F32) -> float:
 
 
 @jit
-def _marginal_cost(gen_p: F32, gen_cost_per_mw: F32) -> float:
+def marginal_cost(gen_p: F32, gen_cost_per_mw: F32) -> float:
     """Cost per MWh of the dearest generator that produces now; 0 when none does."""
     dearest = 0.0
     for gen in range(gen_p.shape[0]):
@@ -237,7 +237,8 @@ def _dearest(gen_cost_per_mw: F32) -> float:
 
 
 @jit
-def _total(powers: F32) -> float:
+def total(powers: F32) -> float:
+    """Their sum, MW."""
     total = 0.0
     for k in range(powers.shape[0]):
         total += np.float64(powers[k])
@@ -245,7 +246,8 @@ def _total(powers: F32) -> float:
 
 
 @jit
-def _magnitude(powers: F32) -> float:
+def magnitude(powers: F32) -> float:
+    """The sum of their absolute values, MW."""
     total = 0.0
     for k in range(powers.shape[0]):
         total += abs(np.float64(powers[k]))

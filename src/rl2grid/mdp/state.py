@@ -20,6 +20,16 @@ SURVIVE, OVERLOAD, COST = 0, 1, 2
 """Columns of the reward components."""
 MARGIN_SCORE, OVERLOAD_SCORE, TOPOLOGY_SCORE = 0, 1, 2
 """Columns of the scores of the paper's Section 5."""
+(
+    LOSSES_COST,
+    REDISPATCH_COST,
+    CURTAILMENT_COST,
+    STORAGE_COST,
+    STORAGE_ENERGY,
+    RENEWABLE_USED,
+    RENEWABLE_AVAILABLE,
+) = range(7)
+"""Columns of what operation costs, see :mod:`rl2grid.mdp.operation`: four costs, then three energies in MWh."""
 
 
 class GridState(NamedTuple):
@@ -113,6 +123,8 @@ class GridState(NamedTuple):
     episode_components: Annotated[F64, row("component", "SURVIVE, OVERLOAD, COST")]
     episode_costs: Annotated[F64, row("cost", ", ".join(CONSTRAINTS))]
     episode_scores: Annotated[F64, row("score", "margin, overload, topology: sums over steps")]
+    episode_operation: Annotated[F64, row("operation", "costs and energies, see `rl2grid.mdp.operation`")]
+    curtailed: Annotated[F64, row("", "curtailed in the step before, as operation counts it", "MW")]
     decisions: Annotated[I32, row("", "agent actions")]
 
 
@@ -130,5 +142,5 @@ def new_state(grid: Grid, n: int) -> GridState:
         "max_changes": np.array([grid.rules.max_line_changes, grid.rules.max_sub_changes], np.int32),
     }
     shared = {name: getattr(grid, name) for name in fields_of(GridState, Role.CONSTANT) if name not in own}
-    sizes = axis_sizes(grid) | {"component": 3, "cost": len(CONSTRAINTS), "score": 3}
+    sizes = axis_sizes(grid) | {"component": 3, "cost": len(CONSTRAINTS), "score": 3, "operation": 7}
     return allocate(GridState, sizes, n, **own, **shared)

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rl2grid.errors import UsageError
-from rl2grid.records.episodes import FACTS, Episode, check_values
+from rl2grid.records.episodes import FACTS, OPERATION, Episode, check_values
 from rl2grid.records.evaluations import Evaluation, identity_hash, labels
 from rl2grid.records.files import printable, read_json, write_record
 
@@ -79,8 +79,12 @@ class PlayableEntry:
 
 
 def facts_of(episode: Episode) -> dict[str, Any]:
-    """The facts of an episode, by the names of :data:`~rl2grid.records.episodes.FACTS`."""
-    return {column.name: getattr(episode, column.name) for column in FACTS}
+    """The facts of an episode, by the names of :data:`~rl2grid.records.episodes.FACTS`.
+
+    Behind them what operation cost, where that is known.
+    """
+    columns = (*FACTS, *OPERATION) if episode.knows_operation else FACTS
+    return {column.name: getattr(episode, column.name) for column in columns}
 
 
 def episode_hash(facts: Mapping[str, Any], foresight: int = 0) -> str:
@@ -90,6 +94,7 @@ def episode_hash(facts: Mapping[str, Any], foresight: int = 0) -> str:
     counts where there is some.
     """
     values = [float(facts[name]) if kind is float else facts[name] for name, kind, *_ in FACTS]
+    values += [float(facts[column.name]) for column in OPERATION if column.name in facts]
     if foresight:
         values.append(foresight)
     return hashlib.sha256(json.dumps(values).encode()).hexdigest()[:16]
@@ -162,8 +167,9 @@ def _stored(played: PlayedActions) -> dict[str, Any]:
 
 
 def _episode(path: Path, stored: Mapping[str, Any]) -> PlayedActions:
-    facts = {column.name: stored[column.name] for column in FACTS}
-    for column in FACTS:
+    columns = (*FACTS, *(column for column in OPERATION if OPERATION[0].name in stored))
+    facts = {column.name: stored[column.name] for column in columns}
+    for column in columns:
         value, allowed = facts[column.name], _ALLOWED[column.type]
         if not isinstance(value, allowed) or (isinstance(value, bool) and bool not in allowed):
             raise UsageError(f"{path} is a damaged entry of a leaderboard: {column.name} is {value!r}.")

@@ -28,6 +28,8 @@ class Origin(StrEnum):
     """The evaluation that the episode is part of: equal in all its rows; empty outside of one."""
     EPISODE = "episode"
     """The environment and the actions alone: who plays the actions again finds the same, to the last bit."""
+    OPERATION = "operation"
+    """As :attr:`EPISODE`, but None in files that were written before there was such a column."""
     AGENT = "agent"
     """What the agent did beside its actions: who plays these again cannot tell."""
     CLOCK = "clock"
@@ -63,6 +65,11 @@ def _fact(
 
 def _count(meaning: str, unit: str = "", least: int = 0) -> Any:
     return _fact(meaning, unit, least=least, most=2**63)
+
+
+def _operation(meaning: str, unit: str, least: float = -math.inf) -> Any:
+    origin = Origin.OPERATION
+    return field(default=None, metadata={"meaning": meaning, "unit": unit, "origin": origin, "least": least})
 
 
 def _label(meaning: str) -> Any:
@@ -117,6 +124,18 @@ class Episode:
             "least": 0.0,
         },
     )
+    cost_losses: float | None = _operation(
+        "[L2RPN](l2rpn.md): losses, at the dearest running generator's price", "price x MWh"
+    )
+    cost_redispatch: float | None = _operation("redispatch, at that price", "price x MWh", least=0.0)
+    cost_curtailment: float | None = _operation("curtailment that is added, less what is taken back", "price x MWh")
+    cost_storage: float | None = _operation("use of storage, at that price", "price x MWh", least=0.0)
+    cost_blackout: float | None = _operation(
+        "demand of all steps after a game over, at the highest price", "price x MW"
+    )
+    storage_energy: float | None = _operation("energy that storage took in and gave out", "MWh", least=0.0)
+    renewable_used: float | None = _operation("energy that renewables produced", "MWh")
+    renewable_available: float | None = _operation("energy that they would have produced without limits", "MWh")
     wall_time_s: float = _fact("time that the episode took", "s", Origin.CLOCK)
     engine: str = _label("`native` or `reference`")
     scenario_pack_hash: str = _label("of the series")
@@ -124,12 +143,23 @@ class Episode:
     agent_hash: str = _label("of the checkpoint; empty for agents without parameters")
     identity: str = _label("hash of the evaluation's full identity, which is stored beside the rows")
 
+    @property
+    def knows_operation(self) -> bool:
+        """Whether what operation cost is known."""
+        return self.cost_losses is not None
+
+    @property
+    def cost_operation(self) -> float:
+        """What the episode cost by the rules of L2RPN 2020, blackout included; NaN where it is not known."""
+        parts = (self.cost_losses, self.cost_redispatch, self.cost_curtailment, self.cost_storage, self.cost_blackout)
+        return sum(math.nan if part is None else part for part in parts)
+
 
 _TYPES: dict[str, type] = get_type_hints(Episode)
 COLUMNS: tuple[Column, ...] = tuple(
     Column(
         each.name,
-        _TYPES[each.name],
+        float if _TYPES[each.name] == float | None else _TYPES[each.name],
         **{key: each.metadata[key] for key in ("unit", "meaning", "origin", "least", "most") if key in each.metadata},
     )
     for each in fields(Episode)
@@ -140,6 +170,10 @@ LABELS: tuple[Column, ...] = tuple(column for column in COLUMNS if column.origin
 """Columns that the evaluation decides, of which an episode is part."""
 FACTS: tuple[Column, ...] = tuple(column for column in COLUMNS if column.origin is Origin.EPISODE)
 """Columns that the environment and the actions alone decide."""
+OPERATION: tuple[Column, ...] = tuple(column for column in COLUMNS if column.origin is Origin.OPERATION)
+"""Columns of what operation cost."""
+_EARLIER = tuple(column for column in COLUMNS if column.origin is not Origin.OPERATION)
+"""Columns of files that were written before there were those of operation."""
 
 
 def write_episodes(path: Path, episodes: Iterable[Episode]) -> None:
@@ -155,13 +189,15 @@ def read_episodes(path: Path) -> tuple[Episode, ...]:
     """
     text = read_text(path, "a file of episodes", "give it as 'rl2grid evaluate' wrote it")
     head, _, body = text[: text.rfind("\n") + 1].partition("\n")
-    if tuple(head.split(",")) != COLUMN_NAMES:
+    names = tuple(head.split(","))
+    columns = next((all_ for all_ in (COLUMNS, _EARLIER) if names == tuple(one.name for one in all_)), None)
+    if columns is None:
         raise UsageError(f"{path} is no file of episodes: its first line must be {','.join(COLUMN_NAMES)}.")
-    return parse_episodes(path, body.split("\n")[:-1])
+    return parse_episodes(path, body.split("\n")[:-1], columns)
 
 
-def parse_episodes(path: Path, lines: Sequence[str]) -> tuple[Episode, ...]:
-    """The episodes of the lines of a file, which follow its first.
+def parse_episodes(path: Path, lines: Sequence[str], columns: Sequence[Column] = COLUMNS) -> tuple[Episode, ...]:
+    """The episodes of the lines of a file with these columns, which follow its first line.
 
     Raises:
         UsageError: one is no episode.
@@ -170,7 +206,7 @@ def parse_episodes(path: Path, lines: Sequence[str]) -> tuple[Episode, ...]:
         rows = list(csv.reader(lines, strict=True))
     except csv.Error as error:
         raise UsageError(f"{path} is no file of episodes: {error}.") from None
-    return tuple(_parse_row(path, number, row) for number, row in enumerate(rows, start=2))
+    return tuple(_parse_row(path, number, row, columns) for number, row in enumerate(rows, start=2))
 
 
 def check_values(values: Mapping[str, Any]) -> None:
@@ -199,18 +235,21 @@ def _format(value: Any) -> Any:
     return str(value).lower() if isinstance(value, bool) else value
 
 
-def _parse_row(path: Path, number: int, row: list[str]) -> Episode:
+def _parse_row(path: Path, number: int, row: list[str], columns: Sequence[Column]) -> Episode:
     try:
-        if len(row) != len(COLUMNS):
-            raise ValueError(f"it has {len(row)} values, and must have {len(COLUMNS)}")
-        values = {column.name: _parse(column.type, text) for column, text in zip(COLUMNS, row, strict=True)}
+        if len(row) != len(columns):
+            raise ValueError(f"it has {len(row)} values, and must have {len(columns)}")
+        values = {column.name: _parse(column, text) for column, text in zip(columns, row, strict=True)}
         check_values(values)
     except ValueError as error:
         raise UsageError(f"Line {number} of {path} is no episode: {error}.") from None
     return Episode(**values)
 
 
-def _parse(kind: type, text: str) -> Any:
+def _parse(column: Column, text: str) -> Any:
+    kind = column.type
+    if column.origin is Origin.OPERATION and not text:
+        return None
     if kind is bool:
         if text not in ("true", "false"):
             raise ValueError(f"expected true or false, got {text!r}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -22,6 +23,8 @@ BOUNDS: Mapping[str, tuple[float, float]] = {
     "grid_steps": (0.0, np.inf),
 }
 """What columns of episodes cannot leave, where they are bounded."""
+UNKNOWN = Estimate(math.nan, math.nan, math.nan)
+"""Of what no episode says."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +56,8 @@ class Summary:
     score_margin: Estimate
     score_overload: Estimate
     score_topology: Estimate
+    cost_operation: Estimate
+    """What an episode cost by the rules of L2RPN 2020, blackout included; NaN where it is not known."""
     decisions: Estimate
     """Per episode."""
     grid_steps: Estimate
@@ -96,6 +101,7 @@ def summarise(episodes: Sequence[Episode]) -> Summary:
         score_margin=of("score_margin"),
         score_overload=of("score_overload"),
         score_topology=of("score_topology"),
+        cost_operation=of("cost_operation") if all(one.knows_operation for one in episodes) else UNKNOWN,
         decisions=of("decisions"),
         grid_steps=of("grid_steps"),
         game_over=dict(sorted(reasons.items())),
