@@ -61,9 +61,8 @@ class Ours:
 
     def __init__(self, grid: Grid, play: str, rows: int = ROWS, threads: int = 1) -> None:
         self.grid, self.play, self.threads = grid, play, threads
-        topology = play != "continuous"
-        kind = "T" if topology else "R"
-        self.transitions = NativeTransitions(NativeEngine(grid, rows), None, topology, PRESETS["default"], 1.0)
+        kind = "R" if play == "continuous" else "T"
+        self.transitions = NativeTransitions(NativeEngine(grid, rows), None, kind, PRESETS["default"], 1.0)
         self.rows = np.arange(rows)
         self.scale = physical_scale(grid, kind)
         self.observations = np.zeros((rows, observation_size(grid, kind)), np.float32)

@@ -198,7 +198,7 @@ def side_by_side(cell: Cell) -> SideBySide:
     reference, native = engines(cell.grid, cell.dispatch)
     if cell.kind == HEURISTIC_KIND:
         heuristic, _, actions = cell.policy.partition(" ")
-        setting = heuristic, actions == "topology", PRESETS["default"], GAMMA
+        setting = heuristic, "T" if actions == "topology" else "R", PRESETS["default"], GAMMA
         return TransitionsSideBySide(Transitions(reference, *setting), NativeTransitions(native, *setting))
     if cell.kind == WORLDS_KIND:
         return SideBySide(reference, Detour(native, make_probe(native.grid, "mixed", "random")))

@@ -29,7 +29,7 @@ def refused(capsys, *command_line):
 def test_tasks_lists_all_with_their_sizes(capsys):
     assert main(["tasks"]) == 0
     output = capsys.readouterr().out
-    assert "103 tasks" in output
+    assert "199 tasks" in output
     assert "73,357 discrete" in output
     assert "69 continuous" in output
     assert "multi-area opponent" in output
@@ -78,7 +78,8 @@ def test_without_the_extras_the_demonstration_says_what_to_install(missing):
 def test_tasks_of_one_grid(capsys):
     assert main(["tasks", "--grid", "bus14"]) == 0
     output = capsys.readouterr().out
-    assert "7 tasks" in output
+    assert "13 tasks" in output
+    assert "50 discrete and 6 continuous" in output
     assert "bus36" not in output
 
 

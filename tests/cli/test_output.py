@@ -85,7 +85,7 @@ def test_quiet_keeps_results_and_drops_remarks(capsys):
 def test_tasks_as_json(capsys):
     assert main(["tasks", "--json"]) == 0
     tasks = {task["id"]: task for task in json.loads(capsys.readouterr().out)["tasks"]}
-    assert len(tasks) == 103
+    assert len(tasks) == 199
     assert tasks["rl2grid/bus118-MOB-v1-T4-TLO-v0"]["actions"] == 73357
     assert tasks["rl2grid/bus14-R-v0"] == {
         "id": "rl2grid/bus14-R-v0",
@@ -99,6 +99,8 @@ def test_tasks_as_json(capsys):
         "storages": 0,
         "observation": 157,
         "actions": 6,
+        "topology_actions": 0,
+        "continuous_actions": 6,
         "opponent": None,
         "constraint": None,
     }

@@ -173,7 +173,7 @@ def test_batches_keep_every_action():
 
 def test_a_batch_of_joint_actions_is_played_as_one_by_one():
     def transitions():
-        return NativeTransitions(NativeEngine(BUS14, 5), "recovery", True, PRESETS["default"], 0.9)
+        return NativeTransitions(NativeEngine(BUS14, 5), "recovery", "T", PRESETS["default"], 0.9)
 
     batch, single = transitions(), transitions()
     for i in range(5):

@@ -110,7 +110,7 @@ def _long_tally(grid_id):
 def test_transitions_agree(grid_id, heuristic):
     """With the heuristic deciding on each engine's own state, transitions have the same length and sums."""
     row, grid = 1, load_grid(grid_id)
-    pair = [Transitions(each, heuristic, True, PRESETS["default"], 0.99) for each in engines(grid_id, "exact")]
+    pair = [Transitions(each, heuristic, "T", PRESETS["default"], 0.99) for each in engines(grid_id, "exact")]
     states, rows = [each.engine.state for each in pair], (0, row)
     episode = plan(grid_id, 5, row)
     short = EpisodePlan(5, row, episode.scenario_id, episode.start, 60)
@@ -326,7 +326,7 @@ def test_transitions_are_compared_and_a_heuristic_that_differs_is_found(heuristi
     reference, native = engines("bus36-MO-v0", "exact")
 
     def play(other):
-        settings = (True, PRESETS["default"], 0.99)
+        settings = ("T", PRESETS["default"], 0.99)
         pair = TransitionsSideBySide(
             Transitions(reference, heuristic, *settings), NativeTransitions(native, other, *settings)
         )

@@ -17,7 +17,8 @@ from rl2grid.grids import find_system
 from rl2grid.scenarios.folder import FolderContent
 from rl2grid.scenarios.recorded import RecordedScenarios
 
-IDS = ("rl2grid/mine-T0-v0", "rl2grid/mine-T0-LSI-v0", "rl2grid/mine-T0-TLO-v0", "rl2grid/mine-R-v0")
+KINDS = ("T0", "T0-LSI", "T0-TLO", "R", "H0", "H0-LSI", "H0-TLO")
+IDS = tuple(f"rl2grid/mine-{kind}-v0" for kind in KINDS)
 
 
 @pytest.fixture
@@ -34,6 +35,7 @@ def test_a_grid_has_tasks_as_long_as_it_is_registered():
         assert all(task_id in gymnasium.registry for task_id in IDS)
         assert find_task("mine-T0").n_actions == 209
         assert find_task("mine-R").n_actions == 6
+        assert find_task("mine-H0").n_actions == 209 + 6
         with pytest.raises(UsageError, match=r"the tasks of mine are .* with level 0, and mine-R-v0"):
             find_task("mine-T1")
     assert all_tasks() == before
@@ -127,7 +129,9 @@ def run_with(systems, folder):
 def test_the_environment_variable_names_what_registers_systems(name, tmp_path):
     (tmp_path / "own_grids.py").write_text(OWN_GRIDS)
     done = run_with(name, tmp_path)
-    ids = [f"rl2grid/yours-{name}-v0" for name in ("T0", "T1", "T0-LSI", "T1-LSI", "T0-TLO", "T1-TLO", "R")]
+    topology = [f"{level}{constraint}" for constraint in ("", "-LSI", "-TLO") for level in (0, 1)]
+    kinds = [*(f"T{rest}" for rest in topology), "R", *(f"H{rest}" for rest in topology)]
+    ids = [f"rl2grid/yours-{kind}-v0" for kind in kinds]
     assert done.stdout.strip() == f"{ids} False", done.stderr
 
 

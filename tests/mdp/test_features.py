@@ -134,5 +134,5 @@ def test_a_constant_that_is_zero_leaves_the_entry_in_its_unit():
     ],
 )
 def test_an_unknown_kind_is_refused(ask):
-    with pytest.raises(UsageError, match=r"Kind of task .* does not exist: choose one of T, R\."):
+    with pytest.raises(UsageError, match=r"Kind of task .* does not exist: choose one of T, R, H\."):
         ask(load_grid("bus14"))

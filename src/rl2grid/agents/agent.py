@@ -9,9 +9,12 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from rl2grid.mdp.actions import INJECTION, TOPOLOGY
+
 Observation = NDArray[np.float32]
 Action = Any
-"""``int`` on topology tasks (Discrete), float32 [continuous] in [-1, 1] on redispatching tasks (Box)."""
+"""``int`` on topology tasks (Discrete), float32 [continuous] in [-1, 1] on redispatching tasks (Box), a dict of both,
+``topology`` and ``injection``, on joint tasks (Dict)."""
 Info = Mapping[str, Any]
 
 
@@ -53,7 +56,7 @@ class SpecialisedAgent(Protocol):
     """An agent that cannot play all kinds of task; those without ``kinds`` can."""
 
     kinds: tuple[str, ...]
-    """``"T"``: topology tasks, ``"R"``: redispatching tasks; ``bind`` refuses the others."""
+    """``"T"``: topology tasks, ``"R"``: redispatching tasks, ``"H"``: joint tasks; ``bind`` refuses the others."""
 
 
 class Considered(NamedTuple):
@@ -78,8 +81,47 @@ class ExplainingAgent(Protocol):
 
 
 def no_intervention(space: gymnasium.Space[Any]) -> Action:
-    """The action that changes nothing: id 0 of a topology task, zeros of a redispatching task."""
+    """The action that changes nothing: id 0 of a topology task, zeros of a redispatching task, both of a joint task."""
+    if isinstance(space, gymnasium.spaces.Dict):
+        return {name: no_intervention(part) for name, part in space.items()}
     if isinstance(space, gymnasium.spaces.Discrete):
         return 0
     assert isinstance(space, gymnasium.spaces.Box)
     return np.zeros(space.shape, space.dtype)
+
+
+def intervenes(action: Action) -> bool:
+    """Whether an action, or a part of it, changes something."""
+    parts = action.values() if isinstance(action, Mapping) else (action,)
+    return any(np.any(part) for part in parts)
+
+
+def key_of(action: Action) -> bytes:
+    """What equal actions of a task have in common, to look them up."""
+    if isinstance(action, Mapping):
+        return b"".join(np.asarray(action[name]).tobytes() for name in sorted(action))
+    return np.asarray(action).tobytes()
+
+
+def has_topology_actions(space: gymnasium.Space[Any]) -> bool:
+    """Whether actions of ``space`` are topology actions, or have such a part."""
+    return isinstance(space, gymnasium.spaces.Discrete | gymnasium.spaces.Dict)
+
+
+def has_injections(space: gymnasium.Space[Any]) -> bool:
+    """Whether actions of ``space`` are continuous, or have such a part."""
+    return isinstance(space, gymnasium.spaces.Box | gymnasium.spaces.Dict)
+
+
+def topology_action(space: gymnasium.Space[Any], chosen: int) -> Action:
+    """The action of ``space`` that changes the topology and injects nothing."""
+    if isinstance(space, gymnasium.spaces.Dict):
+        return {**no_intervention(space), TOPOLOGY: chosen}
+    return chosen
+
+
+def injecting_action(space: gymnasium.Space[Any], values: NDArray[np.float32], chosen: int = 0) -> Action:
+    """The action of ``space`` that injects, and on joint tasks plays the topology action ``chosen``."""
+    if isinstance(space, gymnasium.spaces.Dict):
+        return {TOPOLOGY: chosen, INJECTION: values}
+    return values

@@ -14,7 +14,6 @@ from rl2grid.agents.dispatch import (
     control_positions,
     controls,
     encode,
-    worst_loading,
 )
 from rl2grid.agents.linear_programme import Affine, Programme
 from rl2grid.arrays import F64
@@ -37,17 +36,21 @@ class DcOpf(DispatchAgent):
     A linear programme on the DC approximation, solved at every decision in which the grid is not safe or something is
     dispatched; in the latter case, it brings the dispatch back towards zero as far as the lines allow. While the grid
     is not safe, the action must leave a lower worst loading than doing nothing by ``simulate``; else nothing is done.
+    On joint tasks it leaves the topology as it is.
     """
 
     name = "dc-opf"
 
     refusal = (
         "Agent 'dc-opf' cannot play a topology task (-T0-, -T1-, ...), which has no redispatch: "
-        "choose a redispatching task (-R-) or the agent 'milp'."
+        "choose a redispatching task (-R-), a joint one (-H0-, -H1-, ...) or the agent 'milp'."
     )
 
     def act(self, observation: Observation, info: Info) -> Action:
-        """The action that the programme asks for, if the forecast confirms it; zeros otherwise."""
+        """The action that the programme asks for, if the forecast confirms it; else the one that changes nothing."""
+        return self._as_action(self._choose())
+
+    def _choose(self) -> NDArray[np.float32]:
         state: GridState = self._env.state
         safe = is_safe(state, 0)
         if safe and not anything_dispatched(state):
@@ -55,7 +58,7 @@ class DcOpf(DispatchAgent):
         action = self._plan(state)
         if action is None:
             return self._nothing.copy()
-        worst, worst_of_nothing = worst_loading(self._env, action), worst_loading(self._env, self._nothing)
+        worst, worst_of_nothing = self._worst_loading(action), self._worst_loading(self._nothing)
         keeps_safe = safe and worst < _MARGIN + (1.0 - _MARGIN) / 2
         return action if keeps_safe or worst < worst_of_nothing - _WORTHWHILE else self._nothing.copy()
 

@@ -8,6 +8,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from rl2grid.agents.agent import Action, has_injections, injecting_action
 from rl2grid.arrays import F64
 from rl2grid.errors import UsageError
 from rl2grid.grids import STEPS_PER_HOUR, Grid
@@ -36,7 +37,7 @@ class Control(NamedTuple):
 class DispatchAgent:
     """What agents that plan redispatch on the DC flow have in common: the grid and its electrical model."""
 
-    kinds = ("R",)
+    kinds = ("R", "H")
     refusal: ClassVar[str]
     """What is said of tasks without continuous actions."""
 
@@ -46,16 +47,25 @@ class DispatchAgent:
         Raises:
             UsageError: the task has no continuous actions.
         """
-        if not isinstance(env.action_space, gymnasium.spaces.Box):
+        if not has_injections(env.action_space):
             raise UsageError(self.refusal)
         base: Any = env.unwrapped
-        self._env = base
+        self._env, self._space = base, env.action_space
+        self._topology = 0
         self._grid: Grid = base.grid
         self._network = load_network(self._grid)
         self._nothing = np.zeros(continuous_layout(self._grid).size, np.float32)
 
     def reset(self, i: int) -> None:
         """Nothing to forget."""
+
+    def _as_action(self, values: NDArray[np.float32]) -> Action:
+        """The action that injects ``values``; on joint tasks with the topology action that was chosen before."""
+        return injecting_action(self._space, values, self._topology)
+
+    def _worst_loading(self, values: NDArray[np.float32]) -> float:
+        """What :func:`worst_loading` foresees of that action."""
+        return worst_loading(self._env, self._as_action(values))
 
 
 def controls(state: GridState, grid: Grid) -> Control:
@@ -133,7 +143,7 @@ def control_positions(grid: Grid) -> NDArray[np.int32]:
     return np.concatenate((grid.gen_pos_topo_vect[gens], grid.storage_pos_topo_vect[layout.storage])).astype(np.int32)
 
 
-def worst_loading(env: Any, action: NDArray[np.float32]) -> float:
+def worst_loading(env: Any, action: Action) -> float:
     """The largest loading that :meth:`PowerGridEnv.simulate` foresees; infinite where the game would be lost."""
     result = env.simulate(action)
     return np.inf if result.terminated else float(result.observation[env.observation_slices["rho"]].max())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import gymnasium
@@ -23,4 +24,4 @@ class DoNothing:
 
     def act(self, observation: Observation, info: Info) -> Action:
         """The action without effect."""
-        return self._action
+        return copy.deepcopy(self._action)

@@ -9,6 +9,7 @@ import gymnasium
 
 from rl2grid.agents.agent import Action, Agent, Considered, ExplainingAgent, Info, Observation
 from rl2grid.agents.greedy_dispatch import GreedyDispatch
+from rl2grid.agents.greedy_joint import GreedyJoint
 from rl2grid.agents.greedy_topology import GreedyTopology
 from rl2grid.errors import UsageError
 
@@ -16,11 +17,12 @@ from rl2grid.errors import UsageError
 class Greedy:
     """While the grid is not safe, plays the action with a low worst loading in the next step, by its forecast.
 
-    :class:`GreedyTopology` chooses on topology tasks, :class:`GreedyDispatch` on redispatching tasks. It knows neither
-    the opponent's next attack nor what comes after the next step.
+    :class:`GreedyTopology` chooses on topology tasks, :class:`GreedyDispatch` on redispatching tasks and
+    :class:`GreedyJoint` on joint tasks. It knows neither the opponent's next attack nor what comes after the next step.
 
     Args:
-        actions: ids that it may play on topology tasks, do nothing always being one of them; None: all of the task.
+        actions: ids of the topology actions that it may play, do nothing always being one of them; None: all of the
+            task.
     """
 
     name = "greedy"
@@ -51,6 +53,10 @@ class Greedy:
     def _search_of(self, space: gymnasium.Space[Any]) -> Agent:
         if isinstance(space, gymnasium.spaces.Discrete):
             return GreedyTopology(self._actions)
+        if isinstance(space, gymnasium.spaces.Dict):
+            return GreedyJoint(self._actions)
         if self._actions is not None:
-            raise UsageError("Agent 'greedy' can be limited to some actions on topology tasks (-T0-, ...) only.")
+            raise UsageError(
+                "Agent 'greedy' can be limited to some actions on topology tasks (-T0-, ...) and joint ones only."
+            )
         return GreedyDispatch()

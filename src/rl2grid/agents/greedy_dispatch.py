@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rl2grid.agents.agent import Action, Considered, Info, Observation
 from rl2grid.agents.dc_flow import buses, dc_point, sensitivities
@@ -15,7 +16,6 @@ from rl2grid.agents.dispatch import (
     control_positions,
     controls,
     encode,
-    worst_loading,
 )
 from rl2grid.arrays import F64, I64
 from rl2grid.mdp.actions import continuous_layout
@@ -60,11 +60,19 @@ class GreedyDispatch(DispatchAgent):
 
     name = "greedy"
 
-    refusal = "A dispatch cannot be searched for on a topology task: choose a redispatching task (-R-)."
+    refusal = "A dispatch cannot be searched for on a topology task: choose a redispatching task (-R-) or a joint one."
 
     def act(self, observation: Observation, info: Info) -> Action:
         """The action with the least worst loading on the forecast; zeros where none is better."""
+        return self._as_action(self.choose(0))
+
+    def choose(self, topology: int) -> NDArray[np.float32]:
+        """The injection to play; on joint tasks together with the topology action ``topology``.
+
+        The shifts are ranked in the present topology, and tried on the forecast with the topology action.
+        """
         state: GridState = self._env.state
+        self._topology = topology
         self._remember([], np.zeros(0), "")
         if not is_safe(state, 0):
             return self._relieve(state)
@@ -75,16 +83,17 @@ class GreedyDispatch(DispatchAgent):
         if not self._tried:
             return None
         order = np.argsort(self._promised, kind="stable")
-        return Considered("worst loading", [self._tried[k] for k in order], self._promised[order].tolist(), self._why)
+        tried = [self._as_action(self._tried[k]) for k in order]
+        return Considered("worst loading", tried, self._promised[order].tolist(), self._why)
 
-    def _remember(self, tried: list[Action], promised: F64, why: str) -> None:
+    def _remember(self, tried: list[NDArray[np.float32]], promised: F64, why: str) -> None:
         self._tried, self._promised, self._why = tried, promised, why
 
-    def _relieve(self, state: GridState) -> Action:
+    def _relieve(self, state: GridState) -> NDArray[np.float32]:
         control = controls(state, self._grid)
         plans = [control.now, *self._plans(state, control)]
         actions = [self._nothing.copy(), *(encode(state, self._grid, plan) for plan in plans)]
-        loadings = np.array([worst_loading(self._env, action) for action in actions])
+        loadings = np.array([self._worst_loading(action) for action in actions])
         prices = np.array([0.0, *(float(control.price @ np.abs(plan - control.at_rest)) for plan in plans)])
         enough = (loadings < _ENOUGH) & (loadings < loadings[0] - _WORTHWHILE)
         best = int(np.where(enough, prices, np.inf).argmin() if enough.any() else loadings.argmin())
@@ -94,7 +103,7 @@ class GreedyDispatch(DispatchAgent):
         self._remember(actions, loadings, rule)
         return actions[best] if loadings[best] < loadings[0] - _WORTHWHILE else actions[0]
 
-    def _give_back(self, state: GridState) -> Action:
+    def _give_back(self, state: GridState) -> NDArray[np.float32]:
         """The largest share of what is dispatched whose return stays calm; else what loads the lines least."""
         control = controls(state, self._grid)
         rest = np.clip(control.at_rest, control.least, control.most)
@@ -104,7 +113,7 @@ class GreedyDispatch(DispatchAgent):
             if share > 0.0 and not self._can_be_followed(state, plan - control.now):
                 continue
             actions.append(encode(state, self._grid, plan))
-            loadings.append(worst_loading(self._env, actions[-1]))
+            loadings.append(self._worst_loading(actions[-1]))
             if loadings[-1] < _CALM:
                 break
         self._remember(actions, np.array(loadings), "as much dispatch is given back as the forecast allows")

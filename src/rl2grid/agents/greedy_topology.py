@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from rl2grid.agents.agent import Action, Considered, Info, Observation
+from rl2grid.agents.agent import Action, Considered, Info, Observation, has_topology_actions, topology_action
 from rl2grid.agents.recovery import Recovery
 from rl2grid.arrays import F64, Flags
 from rl2grid.errors import UsageError
@@ -39,7 +39,7 @@ class GreedyTopology:
     """
 
     name = "greedy"
-    kinds = ("T",)
+    kinds = ("T", "H")
 
     def __init__(self, actions: Sequence[int] | None = None) -> None:
         self._recovery = Recovery()
@@ -51,13 +51,13 @@ class GreedyTopology:
         Raises:
             UsageError: the task has no topology actions.
         """
-        if not isinstance(env.action_space, gymnasium.spaces.Discrete):
+        if not has_topology_actions(env.action_space):
             raise UsageError(
                 f"Agent {self.name!r} cannot play a redispatching task (-R-), which has no topology actions: "
                 "choose a topology task (-T0-, -T1-, ...) or the agent 'greedy'."
             )
         base: Any = env.unwrapped
-        self._env = base
+        self._env, self._space = base, env.action_space
         self._recovery.bind(env)
         ids = np.arange(len(base.action_catalogue_ids)) if self._chosen is None else np.array(self._chosen)
         self._ids = ids.tolist()
@@ -67,10 +67,14 @@ class GreedyTopology:
         """Nothing to forget."""
 
     def act(self, observation: Observation, info: Info) -> Action:
+        """The best action; the one that changes nothing where none is better. On joint tasks it never injects."""
+        return topology_action(self._space, self.choose())
+
+    def choose(self) -> int:
         """The id of the best action; 0 where none is better than doing nothing."""
         if is_safe(self._env.state, 0):
             self._why = "while the grid is safe, it does what recovery does, if the forecast then stays safe"
-            return self._recover(observation, info)
+            return self._recover()
         outcomes = self._env.what_if(self._ids)
         loading = np.where(outcomes.legal, outcomes.worst_loading, np.inf).astype(np.float64)
         if not loading.min() < loading[_NOTHING] - _WORTHWHILE:
@@ -96,9 +100,9 @@ class GreedyTopology:
         self._why = "the least worst loading: no action that can be undone makes the grid safe"
         return int(loading.argmin())
 
-    def _recover(self, observation: Observation, info: Info) -> Action:
+    def _recover(self) -> int:
         """The recovery heuristic's action, if it keeps the grid as safe as the heuristic asks."""
-        action = self._recovery.act(observation, info)
+        action = self._recovery.choose()
         if action == _NOTHING or action not in self._ids:
             return _NOTHING
         worst = self._env.what_if([action]).worst_loading[0]

@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from rl2grid.agents.agent import Action, Info, Observation
+from rl2grid.agents.agent import Action, Info, Observation, has_topology_actions, topology_action
 from rl2grid.agents.dc_flow import DcPoint, buses, dc_flow, dc_point, is_connected
 from rl2grid.agents.linear_programme import Affine, Programme
 from rl2grid.arrays import F64, I32, Flags
@@ -34,7 +34,7 @@ class Milp:
 
     One mixed-integer linear programme per decision chooses among the legal actions of the task. The choice is checked
     by AC power flow on the forecast (:meth:`PowerGridEnv.what_if`); one that is no better than doing nothing is ruled
-    out and the programme solved again.
+    out and the programme solved again. On joint tasks it never injects.
 
     Args:
         node_limit: nodes of the branch-and-bound tree that the solver may visit per programme; the best choice found by
@@ -48,7 +48,7 @@ class Milp:
     """
 
     name = "milp"
-    kinds = ("T",)
+    kinds = ("T", "H")
 
     def __init__(self, node_limit: int = 100, time_limit: float = 60.0, attempts: int = 3) -> None:
         if node_limit < 1:
@@ -65,13 +65,13 @@ class Milp:
         Raises:
             UsageError: the task has no topology actions.
         """
-        if not isinstance(env.action_space, gymnasium.spaces.Discrete):
+        if not has_topology_actions(env.action_space):
             raise UsageError(
                 "Agent 'milp' cannot play a redispatching task (-R-), which has no topology actions: "
                 "choose a topology task (-T0-, -T1-, ...) or the agent 'dc-opf'."
             )
         base: Any = env.unwrapped
-        self._env = base
+        self._env, self._space = base, env.action_space
         self._grid: Grid = base.grid
         self._network = load_network(self._grid)
         self._catalogue = full_catalogue(self._grid).take(base.action_catalogue_ids)
@@ -82,7 +82,10 @@ class Milp:
         self._last_busbar = np.ones(self._grid.dim_topo, np.int32)
 
     def act(self, observation: Observation, info: Info) -> Action:
-        """The id of the best action that the AC check confirms; 0 where there is none."""
+        """The best action that the AC check confirms; the one that changes nothing where there is none."""
+        return topology_action(self._space, self._choose())
+
+    def _choose(self) -> int:
         state = self._env.state
         on = state.topo_vect[0] > 0
         self._last_busbar[on] = state.topo_vect[0][on]

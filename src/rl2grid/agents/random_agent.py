@@ -12,7 +12,7 @@ from rl2grid.streams import Purpose, Stream
 
 
 class RandomAgent:
-    """Plays uniformly among the legal actions, or uniformly in the box of a redispatching task.
+    """Plays uniformly among the legal actions, or uniformly in the box of a redispatching task; on joint tasks both.
 
     Draws come from counter-based streams: the actions of an episode are a function of the seed, the
     episode number and the masks met, on every machine and with every version of the libraries.
@@ -41,9 +41,14 @@ class RandomAgent:
 
     def act(self, observation: Observation, info: Info) -> Action:
         """A legal action, each with the same probability; do nothing is one of them."""
-        if isinstance(self._space, gymnasium.spaces.Box):
-            draws = self._stream.uniform(int(np.prod(self._space.shape))).reshape(self._space.shape)
-            low, high = self._space.low, self._space.high
-            return (low + draws * (high - low)).astype(self._space.dtype)
+        if isinstance(self._space, gymnasium.spaces.Dict):
+            return {name: self._draw(part) for name, part in self._space.items()}
+        return self._draw(self._space)
+
+    def _draw(self, space: gymnasium.Space[Any]) -> Action:
+        """A topology action or an injection."""
+        if isinstance(space, gymnasium.spaces.Box):
+            draws = self._stream.uniform(int(np.prod(space.shape))).reshape(space.shape)
+            return (space.low + draws * (space.high - space.low)).astype(space.dtype)
         legal = np.flatnonzero(self._env.action_masks())
         return int(legal[self._stream.integer(len(legal))])

@@ -7,7 +7,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from rl2grid.agents.agent import Action, Info, Observation
+from rl2grid.agents.agent import Action, Info, Observation, has_topology_actions, topology_action
 from rl2grid.errors import UsageError
 from rl2grid.mdp.actions import ActionKind, full_catalogue
 from rl2grid.mdp.heuristics import is_safe, recovery_action
@@ -20,11 +20,11 @@ class Recovery:
     """While the grid is safe, brings it back to its reference topology, one action per step; else does nothing.
 
     It plays with the actions of the task: where the step that the heuristic would take is not among
-    them (the lower levels leave most out), it does nothing.
+    them (the lower levels leave most out), it does nothing. On joint tasks it never injects.
     """
 
     name = "recovery"
-    kinds = ("T",)
+    kinds = ("T", "H")
 
     def bind(self, env: gymnasium.Env[Any, Any]) -> None:
         """Index the actions of the task, and remember the environment, whose state is looked at.
@@ -32,13 +32,13 @@ class Recovery:
         Raises:
             UsageError: the task has no topology actions.
         """
-        if not isinstance(env.action_space, gymnasium.spaces.Discrete):
+        if not has_topology_actions(env.action_space):
             raise UsageError(
                 "Agent 'recovery' cannot play a redispatching task (-R-), which has no topology actions: "
                 "choose a topology task (-T0-, -T1-, ...) or the keyword heuristic='recovery'."
             )
         base: Any = env.unwrapped
-        self._env = base
+        self._env, self._space = base, env.action_space
         actions = full_catalogue(base.grid).take(base.action_catalogue_ids)
         keys = zip(actions.kind.tolist(), actions.target.tolist(), actions.masks(), strict=True)
         self._action = {key: action for action, key in enumerate(keys)}
@@ -47,6 +47,10 @@ class Recovery:
         """Nothing to forget."""
 
     def act(self, observation: Observation, info: Info) -> Action:
+        """The heuristic's action; the one that changes nothing where it would idle or the task lacks that action."""
+        return topology_action(self._space, self.choose())
+
+    def choose(self) -> int:
         """The id of the heuristic's action, 0 where it would idle or the task lacks that action."""
         state: GridState = self._env.state
         if not is_safe(state, 0):

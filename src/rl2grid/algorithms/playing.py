@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from gymnasium.spaces import Box, Discrete
+from gymnasium.spaces import Box, Dict, Discrete
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
@@ -38,6 +38,11 @@ def check_environments(algorithm: str, envs: VectorEnv[Any, Any, Any], *, num_en
         if mask_actions and not hasattr(envs, "action_masks"):
             raise UsageError("The environment offers no action_masks(): set mask_actions to False.")
         return False
+    if isinstance(space, Dict):
+        raise UsageError(
+            f"{algorithm} plays Discrete and Box actions, not the Dict of a joint task: wrap the environments in "
+            "VectorJointAsBox or VectorJointAsDiscrete of rl2grid.envs.joint."
+        )
     if not isinstance(space, Box):
         raise UsageError(f"{algorithm} plays Discrete and Box actions, not {type(space).__name__}.")
     if mask_actions:

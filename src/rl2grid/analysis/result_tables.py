@@ -18,6 +18,7 @@ from rl2grid.analysis.table import (
 )
 from rl2grid.envs.tasks import short_id
 from rl2grid.mdp.constraint_table import CONSTRAINTS, THRESHOLDS
+from rl2grid.mdp.features import KINDS
 from rl2grid.mdp.termination import GAME_OVER_TEXT, GameOver
 from rl2grid.records.methods import COSTS, Method, interval_words
 from rl2grid.records.statistics import (
@@ -50,7 +51,7 @@ Methods = Mapping[str, Sequence[Method]]
 
 def result_tables(methods: Methods) -> tuple[ResultTable, ...]:
     """Every table that the results allow; methods of a task are in the order of its ranking."""
-    tables = [survival_table(methods, kind) for kind in ("T", "R") if _tasks(methods, kind)]
+    tables = [survival_table(methods, kind) for kind in KINDS if _tasks(methods, kind)]
     methods = {task: ranking(group) for task, group in methods.items()}
     if len(methods) > 1 and any(len(group) > 1 for group in methods.values()):
         tables.insert(0, overview_table(methods))
@@ -171,7 +172,7 @@ def survival_table(methods: Methods, kind: str) -> ResultTable:
 
     Args:
         methods: by task.
-        kind: ``"T"`` or ``"R"``.
+        kind: one of :data:`rl2grid.mdp.features.KINDS`.
     """
     tasks = _tasks(methods, kind)
     places = _places(itertools.chain.from_iterable(methods[task] for task in tasks))
@@ -191,7 +192,7 @@ def survival_table(methods: Methods, kind: str) -> ResultTable:
         ]
         name = first.grid_id + (f" {first.constraint}" if first.constraint else "")
         rows.append((Cell(name), Cell(str(first.level)), *cells))
-    actions = "topology" if kind == "T" else "redispatch"
+    actions = {"T": "topology", "R": "redispatch", "H": "joint"}[kind]
     caption = (
         f"Mean survival on tasks with {actions} actions (higher is better; best of a task in bold), plus or minus half "
         f"of its interval. {_intervals(methods, tasks)}. "

@@ -26,7 +26,7 @@ INTERRUPTED = 130
 
 COMMANDS: dict[str, str] = {
     "demo": "train DQN on bus14, evaluate it beside simple agents, write a report",
-    "tasks": "list the tasks (103 on the seven grids) and their sizes",
+    "tasks": "list the tasks (103 of the paper and 96 joint ones) and their sizes",
     "train": "train an algorithm on a task",
     "evaluate": "play agents on enumerated scenarios, one row per episode",
     "rank": "rank a grid's topology actions by trying them",

@@ -41,7 +41,7 @@ def _record(task: Task) -> dict[str, Any]:
         "id": task.id,
         "grid": grid.id,
         "kind": task.kind,
-        "level": task.level if task.kind == "T" else None,
+        "level": task.level if task.changes_topology else None,
         "substations": grid.n_sub,
         "lines": grid.n_line,
         "generators": grid.n_gen,
@@ -49,6 +49,8 @@ def _record(task: Task) -> dict[str, Any]:
         "storages": grid.n_storage,
         "observation": observation_size(grid, task.kind),
         "actions": task.n_actions,
+        "topology_actions": task.n_topology_actions,
+        "continuous_actions": task.n_injections,
         "opponent": None if grid.opponent.kind == "none" else grid.opponent.kind,
         "constraint": task.constraint,
     }
@@ -60,7 +62,7 @@ def _cells(task: Task, record: dict[str, Any]) -> tuple[str, ...]:
     return (
         task.id,
         *(str(record[name]) for name in sizes),
-        f"{task.n_actions:,} discrete" if task.kind == "T" else f"{task.n_actions} continuous",
+        task.actions_in_words,
         "maintenance" if opponent is None else f"maintenance, {opponent.replace('_', '-')} opponent",
         task.constraint or "",
     )

@@ -13,6 +13,7 @@ from rl2grid.engines.action_effects import clipping, refusal
 from rl2grid.engines.base import Engine
 from rl2grid.mdp.accumulate import accrue, begin_episode, begin_transition, end_reset
 from rl2grid.mdp.actions import DO_NOTHING, ActionKind, StepAction, one_change
+from rl2grid.mdp.features import changes_topology
 from rl2grid.mdp.heuristics import (
     candidate_action,
     careful_candidate,
@@ -40,8 +41,9 @@ class Transitions:
     engine: Engine
     heuristic: str | None
     """One of :data:`rl2grid.engines.HEURISTICS`; None: the agent decides every step."""
-    topology_task: bool
-    """On continuous tasks the heuristics recovery and careful only reconnect lines."""
+    kind: str
+    """Of task, one of :data:`rl2grid.mdp.features.KINDS`: where agents have no topology actions, the heuristics
+    recovery and careful only reconnect lines."""
     reward: RewardFunction
     gamma: float
     """Discount between the grid steps of a transition."""
@@ -96,14 +98,14 @@ class Transitions:
             return DO_NOTHING
         if self.heuristic == "careful":
             return self._careful_action(i)
-        decide = recovery_action if self.topology_task else reconnect_action
+        decide = recovery_action if changes_topology(self.kind) else reconnect_action
         kind, target = decide(self.engine.state, i)
         return one_change(kind, target)
 
     def _careful_action(self, i: int) -> StepAction:
         """The first candidate that the forecast allows; else nothing."""
         state = self.engine.state
-        end = state.line_status.shape[1] + (len(state.sub_info) if self.topology_task else 0)
+        end = state.line_status.shape[1] + (len(state.sub_info) if changes_topology(self.kind) else 0)
         candidate = careful_candidate(state, i, 0)
         while 0 <= candidate < end:
             action = one_change(*candidate_action(state, candidate))

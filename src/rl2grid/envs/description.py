@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping, Sized
 from typing import Any
 
 import gymnasium
@@ -11,20 +12,45 @@ from numpy.typing import NDArray
 from rl2grid.envs.tasks import Task
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
-from rl2grid.mdp.actions import describe, inject, level_catalogue, level_ids, validate_continuous
+from rl2grid.mdp.actions import (
+    INJECTION,
+    TOPOLOGY,
+    ActionCatalogue,
+    StepAction,
+    describe,
+    inject,
+    joint,
+    level_catalogue,
+    level_ids,
+    validate_continuous,
+)
 from rl2grid.mdp.features import feature_slices, observation_size
 
 
-def check_action(task: Task, action: Any) -> None:
-    """Refuse an action of the wrong shape or value.
+def step_action(task: Task, grid: Grid, catalogue: ActionCatalogue | None, action: Any) -> StepAction:
+    """An action of a task as what an engine plays.
+
+    Args:
+        task: the task.
+        grid: its grid; environments keep that with which they were made.
+        catalogue: the topology actions of the task, if it has some.
+        action: what an agent gave.
 
     Raises:
-        UsageError: what is wrong with it and what is allowed.
+        UsageError: it has the wrong shape or value, and what is allowed.
     """
-    if task.kind == "T":
-        action_number(action, task.n_actions)
-    else:
-        validate_continuous(task.grid, action)
+    if catalogue is None:
+        return inject(validate_continuous(grid, action))
+    if not task.injects:
+        return catalogue[action_number(action, len(catalogue))]
+    check_parts(task, action)
+    change = catalogue[action_number(action[TOPOLOGY], len(catalogue))]
+    return joint(change, inject(validate_continuous(grid, action[INJECTION])))
+
+
+def task_catalogue(task: Task, grid: Grid) -> ActionCatalogue | None:
+    """The topology actions of a task; None where there are none."""
+    return level_catalogue(grid, task.level) if task.changes_topology else None
 
 
 def action_number(action: Any, n_actions: int) -> int:
@@ -39,13 +65,56 @@ def action_number(action: Any, n_actions: int) -> int:
     return int(array)
 
 
+def check_parts(task: Task, action: Any) -> None:
+    """Refuse what is not the two parts of a joint task's action, whatever they hold.
+
+    Raises:
+        UsageError: a part is missing, or there is another one.
+    """
+    if not isinstance(action, Mapping) or set(action) != {TOPOLOGY, INJECTION}:
+        raise UsageError(
+            f"Action {action!r:.80} is none of {task.id}, whose actions are joint: give a dict with {TOPOLOGY!r}, an "
+            f"integer from 0 to {task.n_topology_actions - 1}, and {INJECTION!r}, {task.n_injections} numbers from -1 "
+            "to 1."
+        )
+
+
+def check_number(task: Task, actions: Any, n: int) -> None:
+    """Refuse actions of a vector that are not one for each of ``n`` environments.
+
+    Raises:
+        UsageError: there are more or fewer of them, or of a part of theirs.
+    """
+    if task.kind == "H":
+        check_parts(task, actions)
+    for part in (actions[TOPOLOGY], actions[INJECTION]) if task.kind == "H" else (actions,):
+        given = len(part) if isinstance(part, Sized) and np.iterable(part) else 1
+        if given != n:
+            raise UsageError(f"{given} actions were given for {n} environments: give one each.")
+
+
+def one_by_one(task: Task, actions: Any) -> Iterable[Any]:
+    """The actions of a vector, :func:`check_number` having passed them, one for each environment."""
+    if task.kind != "H":
+        return actions  # type: ignore[no-any-return]
+    pairs = zip(actions[TOPOLOGY], actions[INJECTION], strict=True)
+    return [{TOPOLOGY: topology, INJECTION: injection} for topology, injection in pairs]
+
+
 def single_spaces(task: Task) -> tuple[gymnasium.spaces.Box, gymnasium.Space[Any]]:
     """Observation and action space of one environment."""
     size = observation_size(task.grid, task.kind)
     observations = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
-    if task.kind == "T":
-        return observations, gymnasium.spaces.Discrete(task.n_actions)
-    return observations, gymnasium.spaces.Box(-1.0, 1.0, (task.n_actions,), np.float32)
+    parts: dict[str, gymnasium.Space[Any]] = {}
+    if task.changes_topology:
+        parts[TOPOLOGY] = gymnasium.spaces.Discrete(task.n_topology_actions)
+    if task.injects:
+        parts[INJECTION] = gymnasium.spaces.Box(-1.0, 1.0, (task.n_injections,), np.float32)
+    if len(parts) == 1:
+        (space,) = parts.values()
+        return observations, space
+    # Pairs keep their order; of a dict, Gymnasium sorts the keys.
+    return observations, gymnasium.spaces.Dict(list(parts.items()))
 
 
 class TaskDescription:
@@ -65,9 +134,13 @@ class TaskDescription:
 
     @property
     def action_catalogue_ids(self) -> NDArray[np.int32]:
-        """For each discrete action its id in the grid's full catalogue, int32 [action]."""
-        if self.task.kind != "T":
-            raise UsageError(f"{self.task.id} has continuous actions: only topology tasks have a catalogue.")
+        """For each topology action its id in the grid's full catalogue, int32 [action].
+
+        Raises:
+            UsageError: the task has none.
+        """
+        if not self.task.changes_topology:
+            raise UsageError(f"{self.task.id} has continuous actions: only topology actions have a catalogue.")
         return level_ids(self.task.grid, self.task.level)
 
     def describe_action(self, action: Any) -> str:
@@ -76,8 +149,5 @@ class TaskDescription:
         Raises:
             UsageError: the action does not exist.
         """
-        if self.task.kind == "T":
-            catalogue = level_catalogue(self.task.grid, self.task.level)
-            return describe(self.task.grid, catalogue[action_number(action, len(catalogue))])
-        values = validate_continuous(self.task.grid, action)
-        return describe(self.task.grid, inject(values))
+        task, grid = self.task, self.task.grid
+        return describe(grid, step_action(task, grid, task_catalogue(task, grid), action))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rl2grid.arrays import I64
 from rl2grid.engines.worlds import World, world_of_plain
-from rl2grid.envs.description import check_action
+from rl2grid.envs.description import check_number, one_by_one
 from rl2grid.envs.info import COSTS, GAME_OVER_WORDS
 from rl2grid.envs.info_arrays import InfoForm
 from rl2grid.envs.options import TaskOptions
@@ -18,7 +18,7 @@ from rl2grid.envs.row_view import RowView, public_names
 from rl2grid.envs.rows import Batch
 from rl2grid.envs.task_environments import StreamPosition, TaskEnvironments
 from rl2grid.envs.tasks import Task
-from rl2grid.errors import UsageError, one_of
+from rl2grid.errors import one_of
 from rl2grid.handles import Handle
 from rl2grid.mdp import reports
 from rl2grid.mdp.action_masks import write_action_masks
@@ -185,15 +185,13 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
             for i in range(self._n):
                 self._position(i)
             self._all_begun = True
-        given = len(actions) if hasattr(actions, "__len__") else 1
-        if given != self._n:
-            raise UsageError(f"{given} actions were given for {self._n} environments: give one each.")
+        check_number(self.task, actions, self._n)
         return self._decide(actions)
 
     def _check(self, actions: Any) -> None:
         """Say what is wrong with the first wrong action."""
-        for action in actions:
-            check_action(self.task, action)
+        for action in one_by_one(self.task, actions):
+            self._step_action(action)
 
     @property
     def _state_address(self) -> int:

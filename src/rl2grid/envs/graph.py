@@ -20,20 +20,20 @@ A graph has what the flat observation has, and no flows in MW, which that lacks.
 ========================================================= =========== ====== ======================================
 node feature                                              unit        tasks  with ``normalize="physical"`` over
 ========================================================= =========== ====== ======================================
-``gen_p``, ``load_p``, ``storage_power``                  MW          T R    the grid's largest ``gen_pmax``
-``storage_charge``                                        MWh         T R    the same number
-``theta``: mean over generators, loads, storages; else 0  degrees     T R    180
-``theta_observed``: 1 where there is such an element      0 or 1      T R    1
-``elements``: of the substation's, share on this busbar   share       T R    1
-``time_before_cooldown_sub``: of the substation           steps       T      ``rules.cooldown_sub``
+``gen_p``, ``load_p``, ``storage_power``                  MW          T R H  the grid's largest ``gen_pmax``
+``storage_charge``                                        MWh         T R H  the same number
+``theta``: mean over generators, loads, storages; else 0  degrees     T R H  180
+``theta_observed``: 1 where there is such an element      0 or 1      T R H  1
+``elements``: of the substation's, share on this busbar   share       T R H  1
+``time_before_cooldown_sub``: of the substation           steps       T H    ``rules.cooldown_sub``
 ``target_dispatch``, ``actual_dispatch``,
 ``gen_margin_up``, ``gen_margin_down``,
-``gen_p_before_curtail``                                  MW          R      the grid's largest ``gen_pmax``
+``gen_p_before_curtail``                                  MW          R H    the grid's largest ``gen_pmax``
 ``curtailment``, ``curtailment_limit``: times ``gen_pmax``
-of the renewable generators                               MW          R      the grid's largest ``gen_pmax``
+of the renewable generators                               MW          R H    the grid's largest ``gen_pmax``
 ========================================================= =========== ====== ======================================
 
-Edge features are ``rho``, ``time_before_cooldown_line``, ``timestep_overflow`` (T), ``time_next_maintenance`` and
+Edge features are ``rho``, ``time_before_cooldown_line``, ``timestep_overflow`` (T, H), ``time_next_maintenance`` and
 ``duration_next_maintenance``, as in the flat observation, and ``forward``, 1 from origin to extremity.
 
 Tasks ``R`` do not observe the topology, but cannot divide a substation either: all elements are on busbar 1, and a
@@ -52,7 +52,7 @@ from numpy.typing import NDArray
 
 from rl2grid.envs.tasks import Task
 from rl2grid.errors import UsageError
-from rl2grid.mdp.features import feature_slices, physical_scale
+from rl2grid.mdp.features import changes_topology, feature_slices, injects, physical_scale
 
 Graph = dict[str, NDArray[Any]]
 """The arrays of the module's first table; those of many environments have them as first axis."""
@@ -63,11 +63,13 @@ _CURTAILMENT = ("curtailment", "curtailment_limit")
 _NODE_FEATURES = {
     "T": (*_SHARED_NODE_FEATURES, "time_before_cooldown_sub"),
     "R": (*_SHARED_NODE_FEATURES, *_REDISPATCH, *_CURTAILMENT),
+    "H": (*_SHARED_NODE_FEATURES, "time_before_cooldown_sub", *_REDISPATCH, *_CURTAILMENT),
 }
 _MAINTENANCE = ("time_next_maintenance", "duration_next_maintenance")
 _EDGE_FEATURES = {
     "T": ("rho", "time_before_cooldown_line", "timestep_overflow", *_MAINTENANCE, "forward"),
     "R": ("rho", "time_before_cooldown_line", *_MAINTENANCE, "forward"),
+    "H": ("rho", "time_before_cooldown_line", "timestep_overflow", *_MAINTENANCE, "forward"),
 }
 _HALF_TURN = 180.0
 
@@ -136,7 +138,7 @@ class GraphBuilder:
 
     def _topology(self, features: dict[str, NDArray[np.float64]]) -> NDArray[np.int64]:
         """Busbar of every element, int64 [n, element], -1 when off."""
-        if self._kind == "T":
+        if changes_topology(self._kind):
             return np.rint(features["topo_vect"]).astype(np.int64)
         grid, carries = self._grid, features["rho"] > 0
         topology = np.ones((len(carries), grid.dim_topo), np.int64)
@@ -179,9 +181,9 @@ class GraphBuilder:
             count > 0,
             self._sum(places.every, np.ones(places.every.shape)) / np.tile(grid.sub_info, 2),
         ]
-        if self._kind == "T":
+        if changes_topology(self._kind):
             columns.append(np.tile(features["time_before_cooldown_sub"], 2))
-        else:
+        if injects(self._kind):
             renewable = np.where(grid.gen_renewable, grid.gen_pmax, 0.0)
             columns += [self._sum(places.gen, features[name]) for name in _REDISPATCH]
             columns += [self._sum(places.gen, features[name] * renewable) for name in _CURTAILMENT]
@@ -193,7 +195,7 @@ class GraphBuilder:
         largest = float(self._grid.gen_pmax.max())
         scales = dict.fromkeys(self.node_features, largest)
         scales |= {"theta": _HALF_TURN, "theta_observed": 1.0, "elements": 1.0}
-        if self._kind == "T":
+        if changes_topology(self._kind):
             scales["time_before_cooldown_sub"] = max(float(self._grid.rules.cooldown_sub), 1.0)
         return np.array(list(scales.values()))
 

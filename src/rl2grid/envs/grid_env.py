@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium
@@ -31,14 +32,17 @@ class PowerGridEnv(RowMethods, gymnasium.Env[NDArray[np.float32], Any]):
     A grid has substations, lines with a thermal limit, generators that follow a planned schedule, loads
     and, on some grids, storage. A line above its limit for some steps is tripped by its protection; the
     flow moves to other lines, which may trip in turn. The episode is lost when a load or generator is cut
-    off, the grid falls apart or no power flow exists. The agent changes the topology (tasks `T`), or
-    redispatches, curtails and uses storage (tasks `R`).
+    off, the grid falls apart or no power flow exists. The agent changes the topology (tasks `T`),
+    redispatches, curtails and uses storage (tasks `R`), or does both in one decision (tasks `H`).
 
     ## Action space
     | task | space | meaning |
     |---|---|---|
     | `T<level>` | `Discrete(n)` | 0 does nothing; others move a set of a substation's elements to the other busbar or switch a line. `describe_action(a)` says it in words, `action_masks()` which are legal now |
     | `R` | `Box(-1, 1, (n,), float32)` | redispatch (share of the ramp of a step), curtailment (limit = 1 + min(a, 0)), storage (share of the maximum power); zero does nothing |
+    | `H<level>` | `Dict({"topology": Discrete(n), "injection": Box(-1, 1, (m,), float32)})` | both at once, as in `T<level>` and in `R`; `action_masks()` is of the topology. Nothing of an illegal or ambiguous action is kept, neither part |
+
+    :mod:`rl2grid.envs.joint` makes a `Box` or a `Discrete` of the `Dict`, for libraries that know only these.
 
     ## Observation space
     `Box(-inf, inf, (n,), float32)`. `observation_slices` maps each name to its place; `observe()` gives the present
@@ -46,18 +50,18 @@ class PowerGridEnv(RowMethods, gymnasium.Env[NDArray[np.float32], Any]):
 
     | feature | size | unit | in |
     |---|---|---|---|
-    | `t` | 1 | share of the episode | T, R |
-    | `gen_p`, `gen_theta` | generators | MW, degrees | T, R |
-    | `load_p`, `load_theta` | loads | MW, degrees | T, R |
-    | `rho` | lines | share of the thermal limit | T, R |
-    | `time_before_cooldown_line` | lines | steps | T, R |
-    | `topo_vect` | elements | busbar, -1 when off | T |
-    | `line_status`, `timestep_overflow` | lines | 0/1, steps | T |
-    | `time_before_cooldown_sub` | substations | steps | T |
-    | `target_dispatch`, `actual_dispatch` | generators | MW | R |
-    | `gen_margin_up`, `gen_margin_down` | generators | MW | R |
-    | `gen_p_before_curtail`, `curtailment`, `curtailment_limit` | generators | MW, share of pmax | R |
-    | `time_next_maintenance`, `duration_next_maintenance` | lines | steps | T, R |
+    | `t` | 1 | share of the episode | T, R, H |
+    | `gen_p`, `gen_theta` | generators | MW, degrees | T, R, H |
+    | `load_p`, `load_theta` | loads | MW, degrees | T, R, H |
+    | `rho` | lines | share of the thermal limit | T, R, H |
+    | `time_before_cooldown_line` | lines | steps | T, R, H |
+    | `topo_vect` | elements | busbar, -1 when off | T, H |
+    | `line_status`, `timestep_overflow` | lines | 0/1, steps | T, H |
+    | `time_before_cooldown_sub` | substations | steps | T, H |
+    | `target_dispatch`, `actual_dispatch` | generators | MW | R, H |
+    | `gen_margin_up`, `gen_margin_down` | generators | MW | R, H |
+    | `gen_p_before_curtail`, `curtailment`, `curtailment_limit` | generators | MW, share of pmax | R, H |
+    | `time_next_maintenance`, `duration_next_maintenance` | lines | steps | T, R, H |
     | `storage_charge`, `storage_power_target`, `storage_power`, `storage_theta` | storages | MWh, MW, MW, degrees | where the grid has storage |
 
     With `normalize="physical"` (the default) every entry is divided by a constant of the grid; see
@@ -142,7 +146,7 @@ class PowerGridEnv(RowMethods, gymnasium.Env[NDArray[np.float32], Any]):
         played = self._environments
         played.play(0, action)
         if self.render_mode is not None:
-            self._last_action = np.array(action)
+            self._last_action = copy.deepcopy(action)
         ended = bool(played.state.terminated[0]), bool(played.state.truncated[0])
         return self._observation(), played.reward(0), *ended, played.info(0)
 

@@ -65,7 +65,7 @@ INFO_KEYS: tuple[InfoKey, ...] = (
     InfoKey("game_over_text", "str", "", _ALWAYS, "the game over in words, empty while the grid is alive"),
     InfoKey("over", "bool", "", _ALWAYS, "the episode ended inside `reset`; the next `step` returns the ending"),
     InfoKey("discounted_reward", "float", "", "with gamma=", "sum over the transition of gamma^k times reward k"),
-    InfoKey("action_set_hash", "str", "", "topology tasks", "hash of the task's actions and of their order"),
+    InfoKey("action_set_hash", "str", "", "tasks T and H", "hash of the topology actions and of their order"),
 )
 
 

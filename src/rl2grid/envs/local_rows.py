@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rl2grid.arrays import I64
+from rl2grid.envs.description import one_by_one
 from rl2grid.envs.engine_rows import EngineRows
 from rl2grid.mdp.actions import StepAction
 from rl2grid.scenarios.episodes import EpisodePlan
@@ -17,8 +18,7 @@ class LocalRows(EngineRows[list[StepAction]]):
     """:class:`~rl2grid.envs.rows.Rows` that need Python at every step."""
 
     def _decide(self, actions: Any) -> list[StepAction]:
-        self._check(actions)
-        return [self._step_action(action) for action in actions]
+        return [self._step_action(action) for action in one_by_one(self.task, actions)]
 
     def _play(self, rows: I64, decisions: list[StepAction]) -> None:
         for i in rows.tolist():

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rl2grid.arrays import I64
+from rl2grid.arrays import F32, I64
 from rl2grid.engines.native.orders import refer_to_choices
 from rl2grid.engines.native.transitions import Commands, NativeTransitions, commands_of
 from rl2grid.envs.engine_rows import EngineRows
@@ -17,7 +17,7 @@ from rl2grid.envs.options import TaskOptions
 from rl2grid.envs.task_environments import StreamPosition
 from rl2grid.envs.tasks import Task
 from rl2grid.grids import find_system
-from rl2grid.mdp.actions import DO_NOTHING
+from rl2grid.mdp.actions import DO_NOTHING, INJECTION, TOPOLOGY
 from rl2grid.scenarios.episodes import MAX_STEPS, EpisodePlan
 from rl2grid.scenarios.months import GeneratedScenarios
 from rl2grid.scenarios.splits import TRAIN
@@ -38,6 +38,9 @@ class NativeRows(EngineRows[Commands]):
         if self._catalogue is not None:  # numbers as the engine takes them
             kinds, targets = self._catalogue.kind.astype(np.int64), self._catalogue.target.astype(np.int64)
             self._changes = kinds, targets, self._catalogue.mask.copy()
+            if task.injects:
+                kinds, targets, masks = self._changes
+                self._injections = replace(self._injections, kinds=kinds, targets=targets, masks=masks)
         self._buffers = [np.zeros((n, self._size), np.float32) for _ in range(2)]
         self._last = np.zeros((n, self._size), np.float32)
 
@@ -45,7 +48,13 @@ class NativeRows(EngineRows[Commands]):
         return *super()._arguments(), self._num_threads
 
     def _decide(self, actions: Any) -> Commands:
-        return self._continuous(actions) if self._catalogue is None else self._discrete(actions)
+        if self.task.kind == "H":
+            chosen, end = self._choices(actions[TOPOLOGY], actions)
+            return replace(self._injections, first=chosen, end=end, values=self._values(actions[INJECTION], actions))
+        if self._catalogue is None:
+            return replace(self._injections, values=self._values(actions, actions))
+        chosen, end = self._choices(actions, actions)
+        return Commands(chosen, end, *self._changes, *self._no_injection)
 
     def _play(self, rows: I64, decisions: Commands) -> None:
         self.transitions.play_rows(rows, decisions.take(rows), self._num_threads)
@@ -95,23 +104,30 @@ class NativeRows(EngineRows[Commands]):
         self.transitions.write_observations(rows, *self._normaliser, self._last)
         return self._last[rows]
 
-    def _discrete(self, actions: Any) -> Commands:
+    def _choices(self, ids: Any, actions: Any) -> tuple[I64, I64]:
+        """Topology actions as the engine takes them: the first change of each and the one behind its last, int64 [n].
+
+        Args:
+            ids: of the topology actions, one per row.
+            actions: of which they are a part, or all.
+        """
         assert self._catalogue is not None
-        numbers = np.asarray(actions)
+        numbers = np.asarray(ids)
         if numbers.shape != (self._n,) or numbers.dtype.kind not in "iu":
             self._check(actions)
         chosen, end = numbers.astype(np.int64), np.empty(self._n, np.int64)
         if not refer_to_choices(chosen, len(self._catalogue), end):
             self._check(actions)
-        return Commands(chosen, end, *self._changes, *self._no_injection)
+        return chosen, end
 
-    def _continuous(self, actions: Any) -> Commands:
+    def _values(self, injections: Any, actions: Any) -> F32:
+        """Injections as the engine takes them, float32 [n, continuous]; ``actions`` are what they are a part of."""
         try:
-            values = np.array(actions, np.float32, order="C")
+            values = np.array(injections, np.float32, order="C")
         except (TypeError, ValueError):
             self._check(actions)
             raise
         # NaN compares as false.
-        if values.shape != (self._n, self.task.n_actions) or not (np.abs(values) <= 1).all():
+        if values.shape != (self._n, self.task.n_injections) or not (np.abs(values) <= 1).all():
             self._check(actions)
-        return replace(self._injections, values=values)
+        return values

@@ -25,8 +25,9 @@ files, separated as in ``PATH``. Commands and the processes that they start know
 def register_system(system: System) -> None:
     """Give a grid everything that the seven have: tasks, scenarios, rankings, evaluation, pages.
 
-    Its tasks are ``rl2grid/<id>-T<level>[-LSI|-TLO]-v0`` and ``rl2grid/<id>-R-v0``. Workers of vectors and evaluations
-    know it too. It takes the place of an earlier system of the same grid, in environments that are made from then on.
+    Its tasks are ``rl2grid/<id>-T<level>[-LSI|-TLO]-v0``, ``rl2grid/<id>-R-v0`` and
+    ``rl2grid/<id>-H<level>[-LSI|-TLO]-v0``. Workers of vectors and evaluations know it too. It takes the place of an
+    earlier system of the same grid, in environments that are made from then on.
 
     Raises:
         UsageError: its id cannot be part of a task's, or is that of another grid; or there is nothing to play.

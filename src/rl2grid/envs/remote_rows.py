@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rl2grid.engines.worlds import World
-from rl2grid.envs.description import check_action
+from rl2grid.envs.description import check_number, one_by_one, step_action, task_catalogue
 from rl2grid.envs.options import TaskOptions
 from rl2grid.envs.rows import Batch
 from rl2grid.envs.tasks import Task
 from rl2grid.envs.worker import Worker
-from rl2grid.errors import UsageError
 
 
 class RemoteRows:
@@ -22,6 +21,7 @@ class RemoteRows:
 
     def __init__(self, task: Task, options: TaskOptions, n: int, num_workers: int) -> None:
         self._task, self._options, self._n = task, options, n
+        self._catalogue = task_catalogue(task, task.grid)
         bounds = np.linspace(0, n, num_workers + 1).astype(int).tolist()
         self._parts = [slice(first, last) for first, last in itertools.pairwise(bounds)]
         self._workers = [Worker(task, options, part.stop - part.start) for part in self._parts]
@@ -38,12 +38,10 @@ class RemoteRows:
 
     def step(self, actions: Any) -> Batch:
         """See :meth:`rl2grid.envs.rows.Rows.step`."""
-        rows = list(actions)
-        if len(rows) != self._n:
-            raise UsageError(f"{len(rows)} actions were given for {self._n} environments: give one each.")
-        for action in rows:  # all or none: no worker may have stepped when another's action is refused
-            check_action(self._task, action)
-        return self._together(self._ask("step", [(rows[part],) for part in self._parts]))
+        check_number(self._task, actions, self._n)
+        for action in one_by_one(self._task, actions):  # all or none: no worker may step when another's is refused
+            step_action(self._task, self._task.grid, self._catalogue, action)
+        return self._together(self._ask("step", [(self._of_part(actions, part),) for part in self._parts]))
 
     def action_masks(self) -> NDArray[np.bool_]:
         """See :meth:`rl2grid.envs.rows.Rows.action_masks`."""
@@ -83,6 +81,12 @@ class RemoteRows:
         """End the processes."""
         for worker in self._workers:
             worker.close()
+
+    def _of_part(self, actions: Any, part: slice) -> Any:
+        """The actions of the rows of one worker."""
+        if self._task.kind == "H":
+            return {name: values[part] for name, values in actions.items()}
+        return list(actions)[part]
 
     def _ask(self, method: str, arguments: list[tuple[Any, ...]]) -> list[Any]:
         """Call ``method`` of every worker, all at once."""

@@ -141,12 +141,12 @@ class RowMethods(TaskDescription):
         return self._environments.imagine(self._i, seed)
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """Which discrete actions are legal now, bool [action].
+        """Which topology actions are legal now, bool [action]; of a joint task those of that part.
 
         Raises:
             UsageError: the task has continuous actions.
         """
-        mask = np.zeros(self.task.n_actions, np.bool_)
+        mask = np.zeros(self.task.n_topology_actions, np.bool_)
         self._environments.write_action_mask(self._i, mask)
         return mask
 

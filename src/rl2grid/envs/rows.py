@@ -53,14 +53,15 @@ class Rows(Protocol):
         """Step every row.
 
         Args:
-            actions: one per row: integers [n] of a topology task, floats [n, entry] of a continuous one.
+            actions: one per row: integers [n] of a topology task, floats [n, entry] of a continuous one, a dict of both
+                of a joint one.
 
         Raises:
             UsageError: an action has the wrong shape or value, or nothing was reset yet; then no row has stepped.
         """
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """Legal actions, bool [n, action].
+        """Legal topology actions, bool [n, action].
 
         Raises:
             UsageError: the task has continuous actions.

@@ -8,7 +8,7 @@ observation it tells the sizes alone.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gymnasium
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rl2grid.envs.graph import GraphBuilder
+from rl2grid.envs.joint import discrete_of
 from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
@@ -56,14 +57,23 @@ class Feature:
 
 
 @dataclass(frozen=True, eq=False)
+class JointActions:
+    """The two parts of a joint task's action, flattened or not; see :mod:`rl2grid.envs.joint`."""
+
+    topology: ActionCatalogue
+    injection: ContinuousLayout
+
+
+@dataclass(frozen=True, eq=False)
 class Spec:
     """What a policy observes and what it can do; read-only, picklable, at most some 100 kB but for large catalogues."""
 
     observation_size: int
     """Entries of the flat observation, float32."""
     action_size: int
-    """Discrete actions, or dimensions of a continuous one in [-1, 1]."""
+    """Discrete actions, or dimensions of a continuous one in [-1, 1]. Of a joint task: of the flattened action."""
     continuous: bool
+    """A joint task's are continuous by themselves (:class:`~rl2grid.envs.joint.JointAsBox`)."""
     task: str | None = None
     """Id of the task of rl2grid; None: another environment, of which there is nothing below."""
     normalize: str | None = None
@@ -76,8 +86,9 @@ class Spec:
     """[observation_size]"""
     grid: Grid | None = None
     """Substations, the elements at them (``*_to_subid``), and their places in ``topo_vect`` (``*_pos_topo_vect``)."""
-    actions: ActionCatalogue | ContinuousLayout | None = None
-    """Discrete: kind, target and moved elements of every action. Continuous: what every dimension controls."""
+    actions: ActionCatalogue | ContinuousLayout | JointActions | None = None
+    """Discrete: kind, target and moved elements of every action. Continuous: what every dimension controls. Joint:
+    both."""
 
     def feature(self, name: str) -> Feature:
         """The feature called ``name``.
@@ -124,15 +135,22 @@ def task_spec(task: Task, normalize: str | None = "physical") -> Spec:
     return Spec(
         observation_size=len(shift),
         action_size=task.n_actions,
-        continuous=kind == "R",
+        continuous=task.injects,
         task=task.id,
         normalize=normalize,
         features=tuple(Feature(name, part.start, part.stop, _element(name)) for name, part in slices.items()),
         shift=shift,
         scale=scale,
         grid=grid,
-        actions=level_catalogue(grid, task.level) if kind == "T" else continuous_layout(grid),
+        actions=_actions(task, grid),
     )
+
+
+def _actions(task: Task, grid: Grid) -> ActionCatalogue | ContinuousLayout | JointActions:
+    if not task.changes_topology:
+        return continuous_layout(grid)
+    catalogue = level_catalogue(grid, task.level)
+    return JointActions(catalogue, continuous_layout(grid)) if task.injects else catalogue
 
 
 def spec_of(env: Any) -> Spec:
@@ -142,10 +160,13 @@ def spec_of(env: Any) -> Spec:
     changed them.
 
     Raises:
-        UsageError: observations that are no vectors, or actions that are neither ``Discrete`` nor vectors.
+        UsageError: observations that are no vectors, or actions that are neither ``Discrete`` nor vectors, as those of
+            joint tasks that are not flattened.
     """
     observations = getattr(env, "single_observation_space", None) or env.observation_space
     actions = getattr(env, "single_action_space", None) or env.action_space
+    base = env.unwrapped
+    task = getattr(base, "task", None)
     shape = observations.shape
     if shape is None or len(shape) != 1:
         raise UsageError(f"Policies read flat observations, not observations of shape {shape}.")
@@ -153,10 +174,13 @@ def spec_of(env: Any) -> Spec:
         sizes = Spec(int(shape[0]), int(actions.n), continuous=False)
     elif isinstance(actions, gymnasium.spaces.Box) and len(actions.shape) == 1:
         sizes = Spec(int(shape[0]), int(actions.shape[0]), continuous=True)
+    elif isinstance(actions, gymnasium.spaces.Dict) and isinstance(task, Task):
+        raise UsageError(
+            f"Policies play Discrete actions and vectors, not the joint ones of {task.id}: wrap it in JointAsBox or "
+            "JointAsDiscrete of rl2grid.envs.joint, a vector in VectorJointAsBox or VectorJointAsDiscrete."
+        )
     else:
         raise UsageError(f"Policies play Discrete actions and vectors, not {actions}.")
-    base = env.unwrapped
-    task = getattr(base, "task", None)
     return _with_task(sizes, task, base.options.normalize) if isinstance(task, Task) else sizes
 
 
@@ -172,6 +196,8 @@ def spec_from_state(state: Mapping[str, Any]) -> Spec:
 
 def _with_task(sizes: Spec, task: Task, normalize: str | None) -> Spec:
     spec = task_spec(task, normalize)
+    if task.kind == "H" and not sizes.continuous and sizes.action_size == discrete_of(task).n:
+        spec = replace(spec, action_size=sizes.action_size, continuous=False)
     return spec if spec.state_dict() == {**sizes.state_dict(), "task": task.id, "normalize": normalize} else sizes
 
 

@@ -15,7 +15,7 @@ from rl2grid.engines.action_effects import clipping, refusal
 from rl2grid.engines.base import Engine
 from rl2grid.engines.transition import Listener, Transitions
 from rl2grid.engines.worlds import Standing, Trail, World
-from rl2grid.envs.description import action_number
+from rl2grid.envs.description import action_number, step_action, task_catalogue
 from rl2grid.envs.info import episode_info
 from rl2grid.envs.operation import Operation, operation_of
 from rl2grid.envs.options import TaskOptions
@@ -25,10 +25,7 @@ from rl2grid.mdp.actions import (
     ActionCatalogue,
     StepAction,
     action_set_hash,
-    inject,
     legal_actions,
-    level_catalogue,
-    validate_continuous,
 )
 from rl2grid.mdp.features import feature_slices, observation_size, physical_scale
 from rl2grid.mdp.legality import verdict_on
@@ -75,18 +72,17 @@ def make_transitions(task: Task, options: TaskOptions, n: int) -> Transitions:
     """The transitions of ``n`` environments on the engine that ``options`` asks for."""
     reward = resolve_reward(options.reward)
     gamma = 1.0 if options.gamma is None else options.gamma
-    topology_task = task.kind == "T"
     # Engines are imported here: each loads much that the other does not need.
     if options.engine == "reference":
         from rl2grid.engines.reference.engine import ReferenceEngine
 
         reference = ReferenceEngine(task.grid, n, options.dispatch, options.opponent)
-        return Transitions(reference, options.heuristic, topology_task, reward, gamma)
+        return Transitions(reference, options.heuristic, task.kind, reward, gamma)
     from rl2grid.engines.native.engine import NativeEngine
     from rl2grid.engines.native.transitions import NativeTransitions
 
     native = NativeEngine(task.grid, n, options.dispatch, options.opponent)
-    return NativeTransitions(native, options.heuristic, topology_task, reward, gamma)
+    return NativeTransitions(native, options.heuristic, task.kind, reward, gamma)
 
 
 class TaskEnvironments:
@@ -105,8 +101,8 @@ class TaskEnvironments:
         shift, scale = physical_scale(self.grid, task.kind)
         physical = options.normalize == "physical"
         self._normaliser = (shift, scale) if physical else (np.zeros_like(shift), np.ones_like(scale))
-        self._catalogue = level_catalogue(self.grid, task.level) if task.kind == "T" else None
-        self._hash = action_set_hash(self.grid, task.level) if task.kind == "T" else None
+        self._catalogue = task_catalogue(task, self.grid)
+        self._hash = action_set_hash(self.grid, task.level) if task.changes_topology else None
         self._plans: list[EpisodePlan | None] = [None] * n
         self._positions: list[StreamPosition | None] = [None] * n
         self._pending = np.zeros(n, np.bool_)  # the episode ended inside reset, its ending is still to be returned
@@ -188,13 +184,13 @@ class TaskEnvironments:
         return info
 
     def write_action_mask(self, i: int, out: NDArray[np.bool_]) -> None:
-        """Write to ``out`` [action] which actions are legal in row ``i``."""
+        """Write to ``out`` [action] which topology actions are legal in row ``i``."""
         catalogue = self._topology_catalogue()
         legal_actions(self.state, i, catalogue.kind, catalogue.target, out)
 
     def _topology_catalogue(self) -> ActionCatalogue:
         if self._catalogue is None:
-            raise UsageError(f"{self.task.id} has continuous actions: only topology tasks have action masks.")
+            raise UsageError(f"{self.task.id} has continuous actions: only topology actions have masks.")
         return self._catalogue
 
     def simulate(self, i: int, action: Any, horizon: int) -> SimulationResult:
@@ -423,9 +419,7 @@ class TaskEnvironments:
         out /= scale
 
     def _step_action(self, action: Any) -> StepAction:
-        if self._catalogue is None:
-            return inject(validate_continuous(self.grid, action))
-        return self._catalogue[action_number(action, len(self._catalogue))]
+        return step_action(self.task, self.grid, self._catalogue, action)
 
 
 def _rebuild(

@@ -1,4 +1,4 @@
-"""The tasks of every system, 103 for the seven of the benchmark."""
+"""The tasks of every system: for the seven of the benchmark the 103 of the paper and 96 joint ones."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid, System, find_system, load_grid, system_ids
 from rl2grid.mdp.constraint_table import CONSTRAINTS
+from rl2grid.mdp.features import changes_topology, injects
 
 VERSION = 0
 """Version of every id; raised when anything that defines a result changes."""
@@ -19,16 +20,17 @@ class Task:
 
     grid_id: str
     kind: str
-    """``"T"``: discrete topology actions. ``"R"``: continuous redispatch, curtailment and storage."""
+    """``"T"``: discrete topology actions. ``"R"``: continuous redispatch, curtailment and storage. ``"H"``: joint, both
+    in one decision."""
     level: int
-    """Difficulty of a topology task; 0 for continuous ones."""
+    """Which topology actions there are, from few to all; 0 where there are none."""
     constraint: str | None
     """Safety constraint of the task: None or a name of :data:`~rl2grid.mdp.constraint_table.CONSTRAINTS`."""
 
     @property
     def id(self) -> str:
         """The id that ``gymnasium.make`` takes."""
-        level = str(self.level) if self.kind == "T" else ""
+        level = str(self.level) if self.changes_topology else ""
         constraint = f"-{self.constraint}" if self.constraint else ""
         return f"rl2grid/{self.grid_id}-{self.kind}{level}{constraint}-v{VERSION}"
 
@@ -37,25 +39,62 @@ class Task:
         return load_grid(self.grid_id)
 
     @property
-    def n_actions(self) -> int:
-        """Discrete actions of a topology task, entries of a continuous action otherwise."""
+    def changes_topology(self) -> bool:
+        """Whether there are topology actions: of tasks ``T`` and ``H``."""
+        return changes_topology(self.kind)
+
+    @property
+    def injects(self) -> bool:
+        """Whether agents redispatch, curtail and store: in tasks ``R`` and ``H``."""
+        return injects(self.kind)
+
+    @property
+    def n_topology_actions(self) -> int:
+        """Discrete actions, do nothing among them; 0 where there are none."""
+        return self.grid.level_sizes[self.level] if self.changes_topology else 0
+
+    @property
+    def n_injections(self) -> int:
+        """Entries of a continuous action; 0 where there are none."""
         grid = self.grid
-        if self.kind == "T":
-            return grid.level_sizes[self.level]
+        if not self.injects:
+            return 0
         return int(grid.gen_redispatchable.sum() + grid.gen_renewable.sum()) + grid.n_storage
+
+    @property
+    def n_actions(self) -> int:
+        """Discrete actions of a topology task, entries of a continuous action, both together of a joint task."""
+        return self.n_topology_actions + self.n_injections
+
+    @property
+    def actions_in_words(self) -> str:
+        """How many actions there are of which kind."""
+        discrete = f"{self.n_topology_actions:,} discrete" if self.changes_topology else ""
+        continuous = f"{self.n_injections} continuous" if self.injects else ""
+        return " and ".join(filter(None, (discrete, continuous)))
 
 
 def all_tasks() -> dict[str, Task]:
-    """Every task by its id: for the seven grids 32 topology, 64 constrained topology and 7 continuous tasks."""
+    """Every task by its id.
+
+    For the seven grids 32 topology, 64 constrained topology and 7 continuous tasks, the 103 of the paper; and 32 joint
+    and 64 constrained joint ones.
+    """
     return {task.id: task for grid_id in system_ids() for task in tasks_of(find_system(grid_id))}
 
 
 @functools.lru_cache(maxsize=64)
 def tasks_of(system: System) -> tuple[Task, ...]:
-    """The tasks of one system: topology by level, with and without constraint, and the continuous one."""
+    """The tasks of one system.
+
+    Topology by level, with and without constraint; the continuous one; and joint ones by level, likewise.
+    """
     levels = range(len(system.grid.level_sizes))
-    topology = [Task(system.id, "T", level, constraint) for constraint in (None, *CONSTRAINTS) for level in levels]
-    return (*topology, Task(system.id, "R", 0, None))
+    topology, joint = (
+        [Task(system.id, kind, level, constraint) for constraint in (None, *CONSTRAINTS) for level in levels]
+        for kind in ("T", "H")
+    )
+    return (*topology, Task(system.id, "R", 0, None), *joint)
 
 
 def find_task(task: Task | str) -> Task:
@@ -100,12 +139,12 @@ def _unknown_task(task_id: str, name: str) -> UsageError:
     grids = [grid_id for grid_id in system_ids() if name.startswith(f"{grid_id}-")]
     if not grids:
         return UsageError(
-            f"Task {task_id!r} does not exist: an id is <grid>-T<level>[-LSI|-TLO]-v{VERSION} or <grid>-R-v{VERSION} "
-            f"with a grid of {', '.join(system_ids())}."
+            f"Task {task_id!r} does not exist: an id is <grid>-T<level>[-LSI|-TLO]-v{VERSION}, <grid>-R-v{VERSION} or "
+            f"<grid>-H<level>[-LSI|-TLO]-v{VERSION} with a grid of {', '.join(system_ids())}."
         )
     grid_id = max(grids, key=len)
     levels = ", ".join(str(level) for level in range(len(load_grid(grid_id).level_sizes)))
     return UsageError(
-        f"Task {task_id!r} does not exist: the tasks of {grid_id} are {grid_id}-T<level>[-LSI|-TLO]-v{VERSION} "
-        f"with level {levels}, and {grid_id}-R-v{VERSION}."
+        f"Task {task_id!r} does not exist: the tasks of {grid_id} are {grid_id}-T<level>[-LSI|-TLO]-v{VERSION} and "
+        f"{grid_id}-H<level>[-LSI|-TLO]-v{VERSION} with level {levels}, and {grid_id}-R-v{VERSION}."
     )

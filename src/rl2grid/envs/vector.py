@@ -86,6 +86,10 @@ class PowerGridVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], Any, ND
     ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
         """Step every environment.
 
+        Args:
+            actions: integers [environment] of topology tasks, floats [environment, entry] of redispatching tasks, a
+                dict of both, ``topology`` and ``injection``, of joint ones.
+
         Raises:
             UsageError: an action has the wrong shape or value.
         """
@@ -93,7 +97,7 @@ class PowerGridVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], Any, ND
         return batch.observations, batch.rewards, batch.terminated, batch.truncated, batch.infos
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """Which discrete actions are legal now, bool [environment, action]."""
+        """Which topology actions are legal now, bool [environment, action]; of joint tasks those of that part."""
         return self._rows.action_masks()
 
     def save(self, i: int) -> World:

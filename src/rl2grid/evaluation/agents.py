@@ -16,6 +16,7 @@ from rl2grid.agents.recovery import Recovery
 from rl2grid.envs.tasks import Task
 from rl2grid.errors import one_of
 from rl2grid.evaluation.own_agents import is_own, load_own_agent
+from rl2grid.mdp.features import KINDS
 
 AGENTS: dict[str, Callable[[], Agent]] = {
     DoNothing.name: DoNothing,
@@ -30,9 +31,9 @@ AGENTS: dict[str, Callable[[], Agent]] = {
 
 
 def kinds_of(name: str) -> tuple[str, ...]:
-    """Kinds of task that an agent of :data:`AGENTS` can play: ``"T"`` (topology), ``"R"`` (redispatching) or both."""
+    """Kinds of task that an agent of :data:`AGENTS` can play, of :data:`rl2grid.mdp.features.KINDS`."""
     agent = AGENTS[name]
-    return agent.kinds if isinstance(agent, SpecialisedAgent) else ("T", "R")
+    return agent.kinds if isinstance(agent, SpecialisedAgent) else KINDS
 
 
 def make_agent(spec: str | Path, task: Task | None = None) -> Agent:

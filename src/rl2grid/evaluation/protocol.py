@@ -256,7 +256,7 @@ def question(task: Task, keywords: Mapping[str, Any], start: int, scenarios: Seq
         "generator_version": generator_version(task.grid_id, options["split"]),
         "split_version": split_version(task.grid_id, options["split"]),
         "scenario_pack_hash": scenario_pack_hash(task.grid_id, options["split"], scenarios),
-        "action_set_hash": action_set_hash(task.grid, task.level) if task.kind == "T" else None,
+        "action_set_hash": action_set_hash(task.grid, task.level) if task.changes_topology else None,
     }
 
 

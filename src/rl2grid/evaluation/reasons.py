@@ -7,7 +7,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from rl2grid.agents.agent import Action, Agent, Considered, ExplainingAgent, no_intervention
+from rl2grid.agents.agent import Action, Agent, Considered, ExplainingAgent, intervenes, key_of, no_intervention
 from rl2grid.agents.dispatch import worst_loading
 from rl2grid.errors import UsageError
 from rl2grid.mdp.heuristics import SAFE_RHO
@@ -43,7 +43,7 @@ class Reasons:
             UsageError: the agent explains itself with something else than a ``Considered``.
         """
         base: Any = self._env
-        if not np.any(action) and base.state.rho[0].max() < SAFE_RHO:
+        if not intervenes(action) and base.state.rho[0].max() < SAFE_RHO:
             return None
         considered = _checked(self._agent)
         reason_of = self._among_ids if self._discrete else self._among_plans
@@ -86,19 +86,19 @@ class Reasons:
         plans: dict[bytes, tuple[Action, float]] = {}
         if considered:
             pairs = list(zip(considered.actions, considered.values, strict=True))[:SHOWN]
-            plans = {np.asarray(plan).tobytes(): (plan, value) for plan, value in pairs}
+            plans = {key_of(plan): (plan, value) for plan, value in pairs}
         for plan in (nothing, action):
-            plans.setdefault(np.asarray(plan).tobytes(), (plan, np.nan))
+            plans.setdefault(key_of(plan), (plan, np.nan))
         alternatives = [
             Alternative(
-                base.describe_action(plan) if np.any(plan) else "",
+                base.describe_action(plan) if intervenes(plan) else "",
                 self._simulated(plan),
                 value,
-                bool(np.array_equal(plan, action)),
+                key_of(plan) == key_of(action),
             )
             for plan, value in plans.values()
         ]
-        tried = len(considered.actions) if considered else len(alternatives)
+        tried = len(considered.actions) if considered and len(considered.actions) else len(alternatives)
         ranked = tuple(sorted(alternatives, key=lambda each: np.nan_to_num(each.promised, nan=np.inf)))
         return Reason(step, *_said(considered), tried, ranked)
 

@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from rl2grid.agents.agent import Action, Agent, Info
+from rl2grid.agents.agent import Action, Agent, Info, intervenes
 from rl2grid.evaluation.collapse import lost_elements
 from rl2grid.evaluation.episode import play_episode
 from rl2grid.evaluation.reasons import Reasons
@@ -82,7 +82,7 @@ class _Recorder:
         """Keep a decision, in words unless it does nothing."""
         step = int(info["step"])
         self.decision_steps.append(step)
-        self.actions.append(self._env.describe_action(action) if np.any(action) else "")
+        self.actions.append(self._env.describe_action(action) if intervenes(action) else "")
         reason = self._reasons.of(action, step)
         if reason is not None:
             self.reasons.append(reason)

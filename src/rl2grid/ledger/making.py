@@ -23,6 +23,7 @@ from rl2grid.ledger.replay import (
     play_again,
     scenarios_of,
 )
+from rl2grid.mdp.actions import INJECTION, TOPOLOGY
 from rl2grid.records.collection import find_evaluations
 from rl2grid.records.entries import Actions, PlayableEntry, PlayedActions, action_dtype
 from rl2grid.records.evaluations import Evaluation, is_evaluation, load_evaluation
@@ -143,4 +144,5 @@ def _training_facts(run: Path) -> dict[str, Any]:
 def _as_array(kept: list[Action], task: Task) -> Actions:
     if task.kind == "T":
         return np.array(kept, dtype=np.int64).astype(action_dtype(task.n_actions))
-    return np.array(kept, dtype="<f4").reshape(len(kept), task.n_actions)
+    rows = [np.append(action[TOPOLOGY], action[INJECTION]) for action in kept] if task.kind == "H" else kept
+    return np.array(rows, dtype="<f4").reshape(len(rows), task.n_injections + (task.kind == "H"))

@@ -6,6 +6,7 @@ and must find the same numbers, to the last bit, with the same versions of the l
 
 from __future__ import annotations
 
+import copy
 import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -13,7 +14,6 @@ from dataclasses import fields
 from typing import Any
 
 import gymnasium
-import numpy as np
 
 from rl2grid.agents.agent import Action, Agent, Info
 from rl2grid.envs.options import TaskOptions, changed_options
@@ -50,7 +50,7 @@ def play_again(
     """Play an episode again and keep the actions."""
 
     def note(action: Action, info: Info) -> None:
-        kept.append(np.array(action))
+        kept.append(copy.deepcopy(action))
         tell(int(info["step"]) / int(info["episode_length"]))
 
     return play_episode(agent, env, scenario=asked.scenario, seed=asked.seed, start=asked.start, on_decision=note)

@@ -25,6 +25,7 @@ from rl2grid.ledger.replay import (
     scenarios_of,
 )
 from rl2grid.ledger.subjects import Subject, play_test
+from rl2grid.mdp.actions import INJECTION, TOPOLOGY
 from rl2grid.records.entries import Actions, PlayableEntry, PlayedActions
 from rl2grid.records.ledger import HashedTest
 from rl2grid.scenarios.library import check_in_split
@@ -67,7 +68,7 @@ def verify_entry(entry: PlayableEntry, on_progress: OnProgress = lambda played: 
     task = find_task(entry.identity["task"])
     with environment(task, keywords_of(entry.identity, "")) as env:
         for number, stored in enumerate(entry.episodes):
-            agent = _StoredActions(stored.actions)
+            agent = _StoredActions(stored.actions, task.kind)
             try:
                 again = play_again(agent, env, stored.episode, [], after(number, on_progress))
             except _NoMoreActionsError:
@@ -107,8 +108,8 @@ class _StoredActions:
 
     name = "stored actions"
 
-    def __init__(self, actions: Actions) -> None:
-        self._actions = iter(actions)
+    def __init__(self, actions: Actions, kind: str) -> None:
+        self._actions, self._kind = iter(actions), kind
 
     def bind(self, env: gymnasium.Env[Any, Any]) -> None:
         """Nothing to look at."""
@@ -121,7 +122,9 @@ class _StoredActions:
         action = next(self._actions, None)
         if action is None:
             raise _NoMoreActionsError
-        return int(action) if np.ndim(action) == 0 else action
+        if self._kind == "H":
+            return {TOPOLOGY: int(action[0]), INJECTION: action[1:]}
+        return int(action) if self._kind == "T" else action
 
 
 def _check_actions(episode: PlayedActions, task: Task, name: str) -> None:
@@ -130,8 +133,11 @@ def _check_actions(episode: PlayedActions, task: Task, name: str) -> None:
         fits = actions.ndim == 1 and actions.dtype.kind == "u" and bool((actions < task.n_actions).all())
         allowed = f"ids of 0 to {task.n_actions - 1}"
     else:
-        fits = actions.shape[1:] == (task.n_actions,) and actions.dtype == np.float32
-        fits = fits and bool((np.abs(actions) <= 1).all())
-        allowed = f"float32 of {task.n_actions} values between -1 and 1"
+        ids = int(task.kind == "H")
+        fits = actions.shape[1:] == (ids + task.n_injections,) and actions.dtype == np.float32
+        fits = fits and bool((np.abs(actions[:, ids:]) <= 1).all())
+        fits = fits and bool(np.isin(actions[:, :ids], np.arange(task.n_topology_actions)).all())
+        allowed = f"float32 of {task.n_injections} values between -1 and 1"
+        allowed += f" behind an id of 0 to {task.n_topology_actions - 1}" if ids else ""
     if not fits:
         raise UsageError(f"{name} was changed: actions of the episode {episode.name} are not {allowed}.")

@@ -2,7 +2,7 @@
 
 An action is any number of *changes* of lines and substations and at most one *injection*
 (:class:`StepAction`); which of them the rules allow is told by :mod:`rl2grid.mdp.legality`. Tasks offer
-actions of one change, or injections.
+actions of one change, injections, or one change and an injection together.
 
 The full catalogue of a grid holds do nothing, then every move of a set of one substation's elements
 to the other busbar, then the switch of every line: sum over substations of ``2^(n - 1) - 1`` plus
@@ -40,6 +40,8 @@ Ids = NDArray[np.int32]
 Masks = NDArray[np.uint64]
 
 
+TOPOLOGY, INJECTION = "topology", "injection"
+"""Names of the parts of a joint task's action, in this order."""
 LARGEST_CATALOGUE = 1 << 22
 """Actions that :func:`full_catalogue` enumerates at most: a substation of 22 elements has half of them."""
 WORD_BITS = 64

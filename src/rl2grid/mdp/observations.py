@@ -18,35 +18,30 @@ def observation_writer(kind: str) -> Callable[[GridState, int, F32], None]:
     """The compiled ``(state, i, out)`` that writes a raw observation of row ``i`` to ``out``, float32 [feature].
 
     Raises:
-        UsageError: ``kind`` is neither ``"T"`` nor ``"R"``.
+        UsageError: ``kind`` is none of :data:`~rl2grid.mdp.features.KINDS`.
     """
     check_kind(kind)
-    return write_topology_observation if kind == "T" else write_redispatch_observation
+    writers = {"T": write_topology_observation, "R": write_redispatch_observation, "H": write_joint_observation}
+    return writers[kind]
 
 
 @jit
 def write_topology_observation(state: GridState, i: int, out: F32) -> None:
     """Write what a topology task observes in row ``i`` to ``out``, float32 [feature], in raw units."""
-    end = _write_shared(state, i, out)
-    end = _write(state.topo_vect[i], out, end)
-    end = _write(state.line_status[i], out, end)
-    end = _write(state.timestep_overflow[i], out, end)
-    end = _write(state.time_before_cooldown_sub[i], out, end)
-    _write_planned_and_stored(state, i, out, end)
+    _write_planned_and_stored(state, i, out, _write_topology(state, i, out, _write_shared(state, i, out)))
 
 
 @jit
 def write_redispatch_observation(state: GridState, i: int, out: F32) -> None:
     """Write what a redispatching task observes in row ``i`` to ``out``, float32 [feature], in raw units."""
-    end = _write_shared(state, i, out)
-    end = _write(state.target_dispatch[i], out, end)
-    end = _write(state.actual_dispatch[i], out, end)
-    end = _write(state.gen_margin_up[i], out, end)
-    end = _write(state.gen_margin_down[i], out, end)
-    end = _write(state.gen_p_before_curtail[i], out, end)
-    end = _write(state.curtailment[i], out, end)
-    end = _write(state.curtailment_limit[i], out, end)
-    _write_planned_and_stored(state, i, out, end)
+    _write_planned_and_stored(state, i, out, _write_dispatch(state, i, out, _write_shared(state, i, out)))
+
+
+@jit
+def write_joint_observation(state: GridState, i: int, out: F32) -> None:
+    """Write what a joint task observes in row ``i`` to ``out``, float32 [feature], in raw units."""
+    end = _write_topology(state, i, out, _write_shared(state, i, out))
+    _write_planned_and_stored(state, i, out, _write_dispatch(state, i, out, end))
 
 
 @jit
@@ -58,6 +53,25 @@ def _write_shared(state: GridState, i: int, out: F32) -> int:
     end = _write(state.load_theta[i], out, end)
     end = _write(state.rho[i], out, end)
     return _write(state.time_before_cooldown_line[i], out, end)
+
+
+@jit
+def _write_topology(state: GridState, i: int, out: F32, begin: int) -> int:
+    end = _write(state.topo_vect[i], out, begin)
+    end = _write(state.line_status[i], out, end)
+    end = _write(state.timestep_overflow[i], out, end)
+    return _write(state.time_before_cooldown_sub[i], out, end)
+
+
+@jit
+def _write_dispatch(state: GridState, i: int, out: F32, begin: int) -> int:
+    end = _write(state.target_dispatch[i], out, begin)
+    end = _write(state.actual_dispatch[i], out, end)
+    end = _write(state.gen_margin_up[i], out, end)
+    end = _write(state.gen_margin_down[i], out, end)
+    end = _write(state.gen_p_before_curtail[i], out, end)
+    end = _write(state.curtailment[i], out, end)
+    return _write(state.curtailment_limit[i], out, end)
 
 
 @jit

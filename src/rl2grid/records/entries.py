@@ -2,7 +2,7 @@
 
 An entry is one JSON file; ``docs/leaderboard.md`` describes it. Actions are the agent's, one for each decision, as
 little-endian numbers, compressed (zlib) and written in base64: ids in as few bytes as the task's number of actions
-needs, continuous actions as float32.
+needs, continuous actions as float32, joint ones as float32 with the id before the continuous ones.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ MAX_BYTES = 500_000_000
 """Of the unpacked actions of one episode: a file that claims more is no entry."""
 
 Actions = NDArray[Any]
-"""Unsigned integers [decision] on topology tasks, float32 [decision, continuous] on redispatching tasks."""
+"""Unsigned integers [decision] on topology tasks, float32 [decision, continuous] on redispatching tasks; on joint tasks
+float32 [decision, 1 + continuous], of which the first column is the id, exact below 2^24."""
 
 _ALLOWED: dict[type, tuple[type, ...]] = {str: (str,), int: (int,), float: (int, float), bool: (bool,)}
 

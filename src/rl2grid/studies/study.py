@@ -57,7 +57,7 @@ NO_HEURISTIC = "none"
 DEFAULT_RETRIES = 2
 DEFAULT_VALIDATIONS = 10
 
-_ACTIONS = {"T": "discrete", "R": "continuous"}
+_ACTIONS = {"T": "discrete", "R": "continuous", "H": "joint"}
 
 _STUDY_KEYS = ("name", "output", "retries", "scale", "group", "slurm")
 _PRODUCT_KEYS = ("label", "algorithms", "agents", "tasks", "heuristics", "hyperparameters", "environment")

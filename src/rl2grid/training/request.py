@@ -24,7 +24,7 @@ from rl2grid.scenarios.library import check_in_split, generator_version, scenari
 from rl2grid.scenarios.splits import TRAIN, VALIDATION, VALIDATION_MONTHS
 from rl2grid.training.tracking import check_tracking
 
-_ACTIONS = {"T": "discrete", "R": "continuous"}
+_ACTIONS = {"T": "discrete", "R": "continuous", "H": "joint"}
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ def identity_of(args: RunArgs) -> dict[str, Any]:
         "grid_hash": task.grid.hash,
         "generator_version": generator_version(task.grid_id, args.env_keywords["split"]),
         "scenario_pack_hash": scenario_pack_hash(task.grid_id, args.env_keywords["split"]),
-        "action_set_hash": action_set_hash(task.grid, task.level) if task.kind == "T" else None,
+        "action_set_hash": action_set_hash(task.grid, task.level) if task.changes_topology else None,
         # Of the list by which the best policy is picked.
         "split_version": split_version(task.grid_id, VALIDATION),
         "targets_version": TARGETS_VERSION,
@@ -207,6 +207,11 @@ def _checked_algorithm(name: str, task: Task) -> Algorithm:
     algorithm = find_algorithm(name)
     if task.kind not in algorithm.kinds:
         able = algorithms_for(task.kind)
+        if not able:
+            raise UsageError(
+                f"No algorithm learns {task.id} from the command line, which has {_ACTIONS[task.kind]} actions: give "
+                "one a vector of environments in VectorJointAsBox or VectorJointAsDiscrete of rl2grid.envs.joint."
+            )
         raise UsageError(
             f"Algorithm {name!r} cannot learn {task.id}, which has {_ACTIONS[task.kind]} actions: "
             f"choose one of {', '.join(able)}."

@@ -28,7 +28,11 @@ from rl2grid.mdp.heuristics import (
     remember_nothing,
     remember_topology,
 )
-from rl2grid.mdp.observations import write_redispatch_observation, write_topology_observation
+from rl2grid.mdp.observations import (
+    write_joint_observation,
+    write_redispatch_observation,
+    write_topology_observation,
+)
 from rl2grid.mdp.rewards import default_components, paper_components, released_components
 from rl2grid.mdp.state import GridState
 from rl2grid.memory import take_next
@@ -215,21 +219,24 @@ def _components(state: GridState, i: int, reward: int) -> Components:
 
 @jit
 def write_observations(
-    address: int, rows: NDArray[np.int64], topology_task: bool, shift: F32, scale: F32, out: F32
+    address: int, rows: NDArray[np.int64], topology: bool, dispatch: bool, shift: F32, scale: F32, out: F32
 ) -> None:
     """Write the observations of ``rows`` to the same rows of ``out``, float32 [n, feature].
 
     Args:
         address: of the handle to the :class:`~rl2grid.engines.native.environments.Environments`.
         rows: environments, int64 [k].
-        topology_task: which features are observed.
+        topology: whether the topology is observed.
+        dispatch: whether the dispatch is observed.
         shift: float32 [feature], subtracted.
         scale: float32 [feature], divided by after that.
         out: the observations.
     """
     state = open_environments(address).state
     for i in rows:
-        if topology_task:
+        if topology and dispatch:
+            write_joint_observation(state, i, out[i])
+        elif topology:
             write_topology_observation(state, i, out[i])
         else:
             write_redispatch_observation(state, i, out[i])

@@ -45,6 +45,7 @@ from rl2grid.mdp.actions import (
     mask_words,
     write_mask,
 )
+from rl2grid.mdp.features import changes_topology, injects
 from rl2grid.mdp.rewards import default_components, paper_components, released_components
 from rl2grid.scenarios.episodes import MAX_STEPS, EpisodePlan
 
@@ -61,7 +62,7 @@ _CODES = {
     ("careful", True): CAREFUL,
     ("careful", False): CAREFUL_RECONNECT,
 }
-"""What a heuristic is on topology tasks, and on others."""
+"""What a heuristic is where agents have topology actions, and where not."""
 _ROWS_PER_THREAD = 8
 """A thread with fewer rows than this costs more than it saves."""
 
@@ -205,7 +206,7 @@ class NativeTransitions(Transitions):
     @property
     def is_compiled(self) -> bool:
         """Whether transitions are played in compiled code from end to end."""
-        exact = self.engine.dispatch == "exact" or self.topology_task
+        exact = self.engine.dispatch == "exact" or not injects(self.kind)
         return not self.listeners and self._reward_code is not None and exact
 
     def reset(self, i: int, plan: EpisodePlan) -> None:
@@ -283,7 +284,8 @@ class NativeTransitions(Transitions):
 
     def write_observations(self, rows: I64, shift: F32, scale: F32, out: F32) -> None:
         """Write the observations of ``rows``, shifted and scaled, to the same rows of ``out``, float32 [n, feature]."""
-        write_observations(self.engine.address, rows, self.topology_task, shift, scale, out)
+        topology, dispatch = changes_topology(self.kind), injects(self.kind)
+        write_observations(self.engine.address, rows, topology, dispatch, shift, scale, out)
 
     def action_effects_of(self, commands: Commands) -> NDArray[np.object_]:
         """What became of the actions of all environments, object [n]: an empty text, or what ``str`` makes one of."""
@@ -347,4 +349,4 @@ class NativeTransitions(Transitions):
     def _heuristic_code(self) -> int:
         if self.heuristic is None:
             return ALONE
-        return _CODES[self.heuristic, self.topology_task]
+        return _CODES[self.heuristic, changes_topology(self.kind)]
