@@ -143,8 +143,8 @@ def _tasks(grid: Grid) -> str:
     rows = ["| task | actions | observation |", "|---|--:|--:|"]
     for task in all_tasks().values():
         if task.grid_id == grid.id and task.constraint is None:
-            with_constraints = " (also `-LSI`, `-TLO`)" if task.kind == "T" else ""
-            actions = f"{task.n_actions:,}" if task.kind == "T" else f"{task.n_actions} continuous"
+            with_constraints = " (also `-LSI`, `-TLO`)" if task.changes_topology else ""
+            actions = f"{task.n_actions:,}" if task.kind == "T" else task.actions_in_words
             rows.append(f"| `{task.id}`{with_constraints} | {actions} | {observation_size(grid, task.kind):,} |")
     return "\n".join(rows)
 

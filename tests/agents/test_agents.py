@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from rl2grid.agents.agent import Agent, RandomizedAgent, no_intervention
+from rl2grid.agents.agent import Agent, RandomizedAgent, intervenes, key_of, no_intervention
 from rl2grid.agents.do_nothing import DoNothing
 from rl2grid.agents.random_agent import RandomAgent
 from rl2grid.agents.recovery import Recovery
@@ -19,6 +19,7 @@ from rl2grid.mdp.state import new_state
 
 DISCRETE = gymnasium.spaces.Discrete(5)
 BOX = gymnasium.spaces.Box(-1.0, 1.0, (3,), np.float32)
+JOINT = gymnasium.spaces.Dict({"topology": DISCRETE, "injection": BOX})
 OBSERVATION = np.zeros(2, np.float32)
 
 
@@ -54,6 +55,20 @@ def test_do_nothing_does_nothing():
     np.testing.assert_array_equal(action, np.zeros(3, np.float32))
     assert action in BOX
     assert no_intervention(DISCRETE) in DISCRETE
+
+
+def test_actions_of_joint_tasks_have_both_parts():
+    nothing = bound(DoNothing(), Stage(JOINT)).act(OBSERVATION, {})
+    assert nothing in JOINT
+    assert not intervenes(nothing)
+    assert not intervenes(bound(Recovery(), Stage(JOINT)).act(OBSERVATION, {}))
+    drawn = bound(RandomAgent(), Stage(JOINT, [False, True, False, False, False])).act(OBSERVATION, {})
+    assert drawn in JOINT
+    assert drawn["topology"] == 1
+    assert intervenes(drawn)
+    assert intervenes({**nothing, "topology": 2})
+    assert intervenes({**nothing, "injection": np.float32([0, 0, 0.1])})
+    assert key_of(drawn) == key_of(dict(reversed(drawn.items()))) != key_of(nothing)
 
 
 def draws(agent: Agent, n: int) -> list[int]:

@@ -8,6 +8,7 @@ import pytest
 from fake_grid import FakeGrid
 
 from rl2grid.agents.do_nothing import DoNothing
+from rl2grid.agents.greedy import Greedy
 from rl2grid.agents.random_agent import RandomAgent
 from rl2grid.engines import ENGINES
 from rl2grid.envs.registration import register_all
@@ -39,6 +40,21 @@ def test_an_episode_lost_inside_reset_is_recorded():
     assert recorded.game_over
     assert recorded.decision_steps == ()
     assert recorded.n_steps >= 1
+
+
+def test_joint_actions_are_told_in_words_with_what_they_promised():
+    register_all()
+    env = gymnasium.make("rl2grid/bus14-H0-v0", disable_env_checker=True, heuristic="idle")
+    agent = Greedy()
+    agent.bind(env)
+    recorded = record_episode(agent, env, scenario=list_scenarios("bus14", "validation")[0], steps=600)
+    acts = [words for words in recorded.actions if words]
+    assert acts
+    assert all("redispatch" in words or "substation" in words or "line" in words for words in acts)
+    for reason in recorded.reasons:
+        (chosen,) = (each for each in reason.alternatives if each.played)
+        assert np.isfinite(chosen.promised)
+        assert any(each.words == "" for each in reason.alternatives)  # doing nothing is always among them
 
 
 @pytest.mark.parametrize("engine", ENGINES)

@@ -29,9 +29,9 @@ Contents = dict[str, Any]
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Evaluations and entries of an agent that acts at random, on discrete and on continuous actions."""
+    """Evaluations and entries of an agent that acts at random, on discrete, continuous and joint actions."""
     folder = tmp_path_factory.mktemp("leaderboard")
-    for name, task in (("discrete", "bus14-T0"), ("continuous", "bus14-R")):
+    for name, task in (("discrete", "bus14-T0"), ("continuous", "bus14-R"), ("joint", "bus14-H0")):
         evaluate("random", task, scenarios=MONTHS, seeds=[0, 1], heuristic="idle", output=folder / name)
         write_entry(folder / f"{name}.json", make_entry(folder / name))
     return folder
@@ -69,7 +69,7 @@ def pack(episode: Contents, actions: Any) -> None:
     episode["shape"] = [len(actions), *episode["shape"][1:]]
 
 
-@pytest.mark.parametrize("name", ["discrete", "continuous"])
+@pytest.mark.parametrize("name", ["discrete", "continuous", "joint"])
 def test_stored_actions_make_the_same_episodes(folder, name):
     told: list[float] = []
     entry = read_entry(folder / f"{name}.json")
@@ -77,8 +77,20 @@ def test_stored_actions_make_the_same_episodes(folder, name):
     assert verify_entry(entry, told.append) is None
     assert told == sorted(told)
     assert told[-1] == 4
-    assert sum(len(one.actions) for one in entry.episodes) > 10
+    assert sum(len(one.actions) for one in entry.episodes) > (10 if name != "joint" else 0)
     assert entry.episodes[0].actions.dtype == (np.uint8 if name == "discrete" else np.float32)
+
+
+@pytest.mark.parametrize(("entry", "value"), [(0, 50.0), (0, 0.5), (1, 1.5)])
+def test_joint_actions_that_are_none_are_refused(folder, tmp_path, entry, value):
+    contents = json.loads((folder / "joint.json").read_text())
+    del contents["checksum"]
+    episode = contents["episodes"][0]
+    actions = unpack(episode)
+    actions[entry] = value
+    episode["actions"] = base64.b64encode(zlib.compress(actions.tobytes())).decode()
+    with pytest.raises(UsageError, match="6 values between -1 and 1 behind an id of 0 to 49"):
+        verify(tmp_path / "changed.json", contents)
 
 
 def test_an_entry_is_the_evaluation(folder, contents):

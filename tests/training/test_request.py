@@ -69,6 +69,11 @@ def test_an_algorithm_that_cannot_learn_the_task_is_refused():
         hyperparameters("td3", "bus14-T0")
 
 
+def test_joint_tasks_are_learned_flattened():
+    with pytest.raises(UsageError, match="bus14-H0-v0 .* joint actions: .* VectorJointAsBox or VectorJointAsDiscrete"):
+        hyperparameters("ppo", "bus14-H0")
+
+
 def test_unknown_presets_and_hyperparameters_are_refused():
     with pytest.raises(UsageError, match="choose one of default, paper"):
         hyperparameters("ppo", "bus14-T0", "papers")

@@ -150,7 +150,7 @@ def _transitions(grid: Grid, opponent: bool) -> tuple[NativeTransitions, NativeT
     # The heuristic plays what the agent plays as long as all is safe, in compiled code; as on tasks without topology,
     # recovery only reconnects.
     nothing, reconnecting = (
-        NativeTransitions(engine, heuristic, False, PRESETS["default"], 1.0)
+        NativeTransitions(engine, heuristic, "R", PRESETS["default"], 1.0)
         for engine, heuristic in zip(engines, ("idle", "recovery"), strict=True)
     )
     return nothing, reconnecting
