@@ -20,7 +20,7 @@ def played(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
 
     def evaluate(agent: str, task: Any, **options: Any):
         asked.append({"agent": agent, **options})
-        made = result(agent, SURVIVALS[agent], split=options["split"])
+        made = result(str(getattr(agent, "name", agent)), SURVIVALS.get(agent, [[0.4]]), split=options["split"])
         return replace(made, folder=options["output"])
 
     monkeypatch.setattr(command, "evaluate", evaluate)
@@ -51,10 +51,20 @@ def test_one_agent_is_not_compared_and_a_look_at_test_months_is_told(capsys):
         (["greedy", "greedy"], "named twice"),
         (["greedy", "random", "--output", "here"], "--output is the folder of one agent"),
         (["greedy", "nobody"], "Agent 'nobody'"),
+        (["greedy", "--seconds", "1"], "--seconds is for the agent planner"),
+        (["planner", "--seconds", "0"], "seconds=0.0 is not allowed"),
     ],
 )
 def test_what_cannot_be_played_is_refused_before_anything_is(played, capsys, words, sentence):
-    agents = [word for word in words if word not in ("--output", "here")]
+    agents = words[: next((k for k, word in enumerate(words) if word[0] == "-"), None)]
     assert main(["evaluate", *agents, "bus14-T0", *words[len(agents) :]]) == 2
     assert sentence in capsys.readouterr().err
     assert played == []
+
+
+def test_the_planner_searches_for_as_long_as_it_is_told(played, capsys):
+    assert main(["evaluate", "planner", "bus14-T0", "--months", "1", "--seconds", "0.1"]) == 0
+    (one,) = played
+    assert one["agent"].name == "planner (0.1 s)"
+    assert one["command"].endswith("--months 1 --seconds 0.1")
+    assert one["output"].name == "validation-1-months-0.1-seconds"

@@ -70,7 +70,7 @@ def test_an_algorithm_that_cannot_learn_the_task_is_refused():
 
 
 def test_joint_tasks_are_learned_flattened():
-    with pytest.raises(UsageError, match="bus14-H0-v0 .* joint actions: .* VectorJointAsBox or VectorJointAsDiscrete"):
+    with pytest.raises(UsageError, match=r"bus14-H0-v0 .* joint actions: .* VectorJointAsBox or VectorJointAsDiscrete"):
         hyperparameters("ppo", "bus14-H0")
 
 

@@ -23,6 +23,8 @@ _LEAST_SHARE = 0.5
 """Share of a line's apparent-power limit that active power may always use, however much reactive power flows."""
 _LEAST_LOADING = 0.05
 """Loadings below say nothing about the limit in MW."""
+_BRIDGE = 1e-6
+"""Share of a line's flow that finds another way, below which there is none."""
 LARGEST_TABLE = 2**23
 """Numbers of a table of sensitivities. The equations behind it are solved anew at every operating point, and what
 agents make of it takes a multiple: at half of this a decision takes a minute and up to 10 GB."""
@@ -103,6 +105,27 @@ def sensitivities(grid: Grid, point: DcPoint) -> F64:
     result = np.zeros((grid.n_line, n_bus))
     result[:, used] = np.linalg.solve((incidence.T @ slope)[np.ix_(used, used)], slope[:, used].T).T
     return result
+
+
+def outage_factors(grid: Grid, table: F64, bus: I32, line: int) -> F64 | None:
+    """MW more on each line per MW that ``line`` carried, once it is lost, float64 [line]; None: the grid falls apart.
+
+    The loss is as if the line's flow were sent from its origin to its extremity over all others (line outage
+    distribution factors); the lost line's own factor is -1.
+
+    Args:
+        grid: the grid.
+        table: what :func:`sensitivities` returns.
+        bus: bus of each element, int32 [topo].
+        line: the closed line that is lost.
+    """
+    ends = grid.line_or_pos_topo_vect[line], grid.line_ex_pos_topo_vect[line]
+    transfer = table[:, bus[ends[0]]] - table[:, bus[ends[1]]]
+    if abs(1.0 - transfer[line]) < _BRIDGE:
+        return None
+    factors: F64 = transfer / (1.0 - transfer[line])
+    factors[line] = -1.0
+    return factors
 
 
 def dc_flow(grid: Grid, point: DcPoint) -> F64:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from rl2grid.agents.agent import Agent
+from rl2grid.agents.planner import Planner
 from rl2grid.analysis.comparison_table import reference_table
 from rl2grid.analysis.summary_table import summary_table
 from rl2grid.analysis.table import table_records
@@ -49,6 +50,9 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         default=None,
         help="processes; by default this one for few native episodes, or one per core",
     )
+    parser.add_argument(
+        "--seconds", type=float, default=None, help="that the planner may search per decision; by default unlimited"
+    )
     parser.add_argument("--output", type=Path, default=None, help="folder of the results of one agent")
     parser.add_argument(
         "--l2rpn",
@@ -68,7 +72,7 @@ def _run(options: argparse.Namespace, output: Output) -> int:
     if options.output is not None and len(agents) > 1:
         raise UsageError("--output is the folder of one agent: leave it out, and each gets a folder of its own.")
     # Before anything is played: one that does not exist would be found after an hour of others.
-    made = [make_agent(agent, task) for agent in agents]
+    made = [_made(agent, task, options.seconds) for agent in agents]
     results = [_evaluated(agent, one, task, options, output) for agent, one in zip(agents, made, strict=True)]
     summaries = [result.summary for result in results]
     records = [asdict(result.summary) | {"foresight": result.foresight, "folder": result.folder} for result in results]
@@ -95,6 +99,14 @@ def _run(options: argparse.Namespace, output: Output) -> int:
     return 0
 
 
+def _made(agent: str, task: Task, seconds: float | None) -> Agent:
+    if seconds is None:
+        return make_agent(agent, task)
+    if agent != "planner":
+        raise UsageError(f"--seconds is for the agent planner, which searches: leave it out for {agent}.")
+    return Planner(seconds=seconds)
+
+
 def _name_of_last(agent: str, made: Agent) -> str | None:
     """What tables call the last policy of a run, so that it can stand beside the best; None for other agents."""
     path = Path(agent)
@@ -103,8 +115,10 @@ def _name_of_last(agent: str, made: Agent) -> str | None:
 
 def _evaluated(agent: str, made: Agent, task: Task, options: argparse.Namespace, output: Output) -> Evaluation:
     chosen = keywords.given(options)
+    command = evaluate_command(agent, task, options.split, options.seeds, options.months, chosen)
+    timed = options.seconds is not None
     return evaluate(
-        agent,
+        made if timed else agent,
         task,
         split=options.split,
         scenarios=None if options.months is None else first_months(task, options.split, options.months),
@@ -113,7 +127,7 @@ def _evaluated(agent: str, made: Agent, task: Task, options: argparse.Namespace,
         output=options.output or _default_output(agent, made, options, task, chosen),
         progress=output.talks,
         name=_name_of_last(agent, made),
-        command=evaluate_command(agent, task, options.split, options.seeds, options.months, chosen),
+        command=f"{command} --seconds {options.seconds:g}" if timed else command,
         **chosen,
     )
 
@@ -138,6 +152,8 @@ def _default_output(
         parts.append(str(chosen["heuristic"]))
     if options.months is not None:
         parts.append(f"{options.months}-months")
+    if options.seconds is not None:
+        parts.append(f"{options.seconds:g}-seconds")
     parts += [flag.removeprefix("--") for flag in environment_flags({**chosen, "heuristic": None})]
     name = "-".join(parts)
     path = Path(agent)

@@ -11,6 +11,7 @@ from rl2grid.agents.do_nothing import DoNothing
 from rl2grid.agents.greedy import Greedy
 from rl2grid.agents.greedy_topology import GreedyN1
 from rl2grid.agents.milp import Milp
+from rl2grid.agents.planner import Planner
 from rl2grid.agents.random_agent import RandomAgent
 from rl2grid.agents.recovery import Recovery
 from rl2grid.envs.tasks import Task
@@ -26,6 +27,7 @@ AGENTS: dict[str, Callable[[], Agent]] = {
     GreedyN1.name: GreedyN1,
     Milp.name: Milp,
     DcOpf.name: DcOpf,
+    "planner": Planner,
 }
 """Agents that need no training, by name."""
 

@@ -1,0 +1,306 @@
+"""A planner: sequences of topology actions and secure dispatch, on forecasts alone (``docs/algorithms/planner.md``)."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from rl2grid.agents.agent import Action, Considered, Info, Observation
+from rl2grid.agents.contingencies import NONE, danger, expected
+from rl2grid.agents.dispatch import controls, encode
+from rl2grid.agents.greedy_topology import effects
+from rl2grid.agents.secure_dispatch import SecureDispatch, Series
+from rl2grid.agents.topology_search import NOTHING, SAFE, TopologySearch
+from rl2grid.arrays import F32, F64
+from rl2grid.engines.native.engine import NativeEngine
+from rl2grid.engines.native.what_if import WhatIf, forecast_of, snapshot_of
+from rl2grid.engines.worlds import Outlook
+from rl2grid.errors import UsageError, one_of
+from rl2grid.grids import Grid
+from rl2grid.mdp.actions import ActionKind, continuous_layout, full_catalogue
+from rl2grid.mdp.heuristics import is_safe
+from rl2grid.mdp.state import GridState
+from rl2grid.powerflow.batch import Snapshot
+from rl2grid.powerflow.model import load_network
+
+INGREDIENTS = (
+    "sequences",
+    "danger",
+    "restoring",
+    "prevention",
+    "dispatch first",
+)
+"""What can be left out of the planner, to see what it is worth."""
+_RESTORE_BELOW = 0.93
+"""Worst loading up to which a substation is brought back to its reference."""
+_DANGER_ADDED = 1e-3
+"""What a restored substation may add to the danger of outages."""
+_ENOUGH = 0.99
+"""Worst loading that dispatch alone must leave for the topology to stay as it is."""
+_PERIOD = 6
+"""Steps between plans while the grid is safe."""
+_LEAST_AGE = 2
+"""Steps that a plan is followed at least, however the dispatch drifts."""
+_SHARES = (1.0, 0.5, 0.2)
+"""Of a plan that the generators could not follow: what is tried of it."""
+_NEGLIGIBLE_PLAN, _NEGLIGIBLE_REQUEST = 0.05, 0.01
+"""MW, and entries of an action, below which a plan changes nothing."""
+_STORING = 0.1
+"""MW of a storage unit in use."""
+
+
+class _Moment(NamedTuple):
+    """What is known when an action is chosen."""
+
+    state: GridState
+    safe: bool
+    ahead: list[Snapshot]  # forecasts of the next steps before anybody acts; none: the generators cannot follow
+
+
+class Planner:
+    """Keeps the grid secure by topology, by redispatch, curtailment and storage, or by both in one step.
+
+    While the grid is safe, it closes lines, brings substations back where that is safe and makes no outage worse, and,
+    where there is an opponent, shifts power every half hour so that no attack or announced outage would overload a
+    line (:class:`~rl2grid.agents.secure_dispatch.SecureDispatch`). When it is not safe, it looks for the sequence of
+    topology actions that makes it so before protections trip a line
+    (:class:`~rl2grid.agents.topology_search.TopologySearch`), and dispatches against what is left; where both can be
+    done, dispatch comes first. It knows forecasts, announced maintenance and which lines the opponent may attack, not
+    when. It is meant to be played without a heuristic, because it acts while the grid is safe.
+
+    Args:
+        without: ingredients of :data:`INGREDIENTS` to leave out.
+        seconds: that a search may take; None: as long as it takes, so that results depend on nothing but the seed.
+
+    Raises:
+        UsageError: there is no such ingredient, or the seconds are not positive.
+    """
+
+    kinds = ("T", "R", "H")
+
+    def __init__(self, without: Collection[str] = (), seconds: float | None = None) -> None:
+        for each in without:
+            if each not in INGREDIENTS:
+                raise one_of("Ingredient", each, INGREDIENTS)
+        if seconds is not None and not seconds > 0:
+            raise UsageError(f"seconds={seconds!r} is not allowed: give a positive number.")
+        self._without, self._seconds = frozenset(without), seconds
+        self.name = "planner" + "".join(f" without {each}" for each in sorted(without))
+        if seconds is not None:
+            self.name += f" ({seconds:g} s)"
+
+    def bind(self, env: gymnasium.Env[Any, Any]) -> None:
+        """Look up the grid, its actions and its electrical model.
+
+        Raises:
+            UsageError: the reference engine plays, which answers no what-if.
+        """
+        base: Any = env.unwrapped
+        if not isinstance(base.engine, NativeEngine):
+            raise UsageError("Agent 'planner' asks what-ifs of the native engine: choose engine=\"native\".")
+        self._env, self._space = base, env.action_space
+        self._grid: Grid = base.grid
+        self._what_if = WhatIf(self._grid)
+        self._search: TopologySearch | None = None
+        if base.task.kind != "R":
+            self._catalogue = full_catalogue(self._grid).take(base.action_catalogue_ids)
+            longest = {"longest": 0} if "sequences" in self._without else {}
+            self._search = TopologySearch(self._grid, self._catalogue, self._what_if, seconds=self._seconds, **longest)
+        self._dispatch: SecureDispatch | None = None
+        if base.task.kind != "T":
+            self._dispatch = SecureDispatch(self._grid, load_network(self._grid), self._what_if)
+
+    def reset(self, i: int) -> None:
+        """Forget the series of the last episode."""
+        self._why = ""
+        self._planned: F64 | None = None
+        self._age = 0
+        if self._dispatch is not None:
+            self._dispatch.reset()
+
+    def act(self, observation: Observation, info: Info) -> Action:
+        """What it plans for the next step."""
+        state: GridState = self._env.state
+        if self._dispatch is not None:
+            self._dispatch.watch(state)
+        moment = self._moment(state)
+        if moment.safe and self._is_calm(moment):
+            topology = self._restoring(moment)
+            injection = self._preventive(moment, topology) if self._dispatch is not None else None
+            return self._action(topology, injection)
+        return self._relieve(moment)
+
+    def explain(self) -> Considered | None:
+        """By what rule the last action was chosen."""
+        return Considered("", (), (), self._why) if self._why else None
+
+    def _moment(self, state: GridState) -> _Moment:
+        engine = self._env.engine
+        point = forecast_of(engine, 0)
+        return _Moment(state, is_safe(state, 0), [] if point is None else [point])
+
+    def _is_calm(self, moment: _Moment) -> bool:
+        """Whether nothing has to be done by the forecast."""
+        if not moment.ahead or self._search is None:
+            return True
+        outcomes, _ = self._search.outcomes(moment.ahead[0], np.zeros(1, np.int32))
+        return bool(outcomes.worst_loading[NOTHING] < SAFE)
+
+    def _restoring(self, moment: _Moment) -> int:
+        """The entry that closes a line or brings a substation back, if that keeps the grid safe; else nothing."""
+        if self._search is None or not moment.ahead or is_at_reference(moment.state):
+            return NOTHING
+        effect = effects(self._grid, moment.state, self._catalogue)
+        closes = effect.restores & (self._catalogue.kind == ActionKind.SWITCH)
+        point = moment.ahead[0]
+        line = self._best_of(point, np.flatnonzero(closes), SAFE)
+        if line:
+            self._why = "while the grid is safe, a line is closed if that keeps it so"
+            return line[0]
+        if "restoring" in self._without:
+            return NOTHING
+        homeward = np.flatnonzero(effect.restores & (self._catalogue.kind == ActionKind.MOVE))
+        candidates = self._best_of(point, homeward, _RESTORE_BELOW)
+        if not candidates:
+            return NOTHING
+        contingencies = expected(self._grid, moment.state)
+        before = danger(self._what_if, point, contingencies)
+        for entry in candidates:
+            after = self._search.after(point, entry)
+            if danger(self._what_if, after, contingencies) <= before + _DANGER_ADDED:
+                self._why = "while the grid is safe, a substation is brought back if that makes no outage worse"
+                return entry
+        return NOTHING
+
+    def _best_of(self, point: Snapshot, entries: NDArray[np.int64], below: float) -> list[int]:
+        """Legal entries after which the worst loading is below a margin, the least loaded first."""
+        if len(entries) == 0:
+            return []
+        assert self._search is not None
+        outcomes, _ = self._search.outcomes(point, entries.astype(np.int32))
+        loading = np.where(outcomes.legal, outcomes.worst_loading, np.inf)
+        return [int(entries[k]) for k in np.argsort(loading, kind="stable").tolist() if loading[k] < below]
+
+    def _preventive(self, moment: _Moment, topology: int) -> F32 | None:
+        """The injection that a safe grid is to have, every half hour and whenever the dispatch drifts."""
+        assert self._dispatch is not None
+        state = moment.state
+        due = int(state.step[0]) % _PERIOD == 0 or topology != NOTHING
+        due = due or np.abs(state.storage_power[0]).max(initial=0.0) > _STORING
+        self._age += 1
+        if due or (self._age >= _LEAST_AGE and self._drifts(state)):
+            self._age = 0
+            point = snapshot_of(self._env.engine, 0)
+            self._planned = self._plan(moment, point, topology, self._series(state), _PERIOD)
+        return None if self._planned is None else self._towards(topology, self._planned)
+
+    def _drifts(self, state: GridState) -> bool:
+        assert self._dispatch is not None
+        return self._dispatch.is_in_use(state) and self._dispatch.is_drifting(state, self._series(state))
+
+    def _relieve(self, moment: _Moment) -> Action:
+        """What makes the grid safe again."""
+        point = moment.ahead[0] if moment.ahead else snapshot_of(self._env.engine, 0)
+        series = None if self._dispatch is None else self._series(moment.state)
+        if self._search is None:
+            assert series is not None
+            self._why = "dispatch against the overload"
+            return self._action(NOTHING, self._injection(moment, point, NOTHING, series))
+        if series is not None and "dispatch first" not in self._without and not self._can_close(moment):
+            injection = self._injection(moment, point, NOTHING, series)
+            if injection is not None and self._worst(NOTHING, injection) < _ENOUGH:
+                self._why = "dispatch alone makes the grid safe"
+                return self._action(NOTHING, injection)
+        topology = NOTHING
+        if moment.ahead:
+            wary = (
+                NONE
+                if "danger" in self._without or moment.state.attacked[0].any()
+                else expected(self._grid, moment.state)
+            )
+            found = self._search.best(moment.ahead, moment.state.timestep_overflow[0], wary)
+            topology = found.action
+            self._why = (
+                f"{found.n_actions} actions lead to a worst loading of {found.worst_loading:.0%}"
+                f"{f', with {found.n_trips} lines tripped' if found.n_trips else ''}"
+            )
+        return self._action(topology, None if series is None else self._injection(moment, point, topology, series))
+
+    def _can_close(self, moment: _Moment) -> bool:
+        state = moment.state
+        switches = self._catalogue.target[self._catalogue.kind == ActionKind.SWITCH]
+        ready = ~state.line_status[0] & (state.time_before_cooldown_line[0] == 0)
+        return bool(ready[switches].any())
+
+    def _series(self, state: GridState) -> Series:
+        assert self._dispatch is not None
+        outlook = self._env.imagine(0).series
+        assert isinstance(outlook, Outlook)
+        return self._dispatch.foreseen(state, outlook.prod_p)
+
+    def _injection(self, moment: _Moment, point: Snapshot, topology: int, series: Series) -> F32 | None:
+        """The continuous action with a topology action, float32 [continuous]; None: none, or it cannot be followed."""
+        self._planned = None
+        planned = self._plan(moment, point, topology, series, 1)
+        return None if planned is None else self._towards(topology, planned)
+
+    def _plan(self, moment: _Moment, point: Snapshot, topology: int, series: Series, steps: int) -> F64 | None:
+        """MW that each control should inject after a topology action, float64 [control]."""
+        assert self._dispatch is not None
+        if topology != NOTHING:
+            assert self._search is not None
+            point = self._search.after(point, topology)
+        prevents = bool(self._grid.opponent.areas) and "prevention" not in self._without
+        contingencies = expected(self._grid, moment.state) if prevents else NONE
+        return self._dispatch.plan(moment.state, point, series, contingencies, not moment.safe, steps)
+
+    def _towards(self, topology: int, planned: F64) -> F32 | None:
+        """The continuous action that comes nearer to a plan; None: nothing of it is left, or it cannot be followed."""
+        assert self._dispatch is not None
+        state = self._env.state
+        injected = self._dispatch.next_step(state, planned)
+        action = encode(state, self._grid, injected)
+        n_gen = len(continuous_layout(self._grid).redispatch)
+        moved = float(np.abs(injected - controls(state, self._grid).now).max(initial=0.0)) >= _NEGLIGIBLE_PLAN
+        if not moved and float(np.abs(action[:n_gen]).max(initial=0.0)) < _NEGLIGIBLE_REQUEST:
+            return None
+        return self._followed(topology, action)
+
+    def _followed(self, topology: int, action: F32) -> F32 | None:
+        """As much of an action as generators can follow by the forecast."""
+        for share in _SHARES:
+            part = (action * np.float32(share)).astype(np.float32)
+            result = self._env.simulate(self._action(topology, part))
+            if not result.terminated and not result.info["illegal"]:
+                return part
+        return None
+
+    def _worst(self, topology: int, injection: F32) -> float:
+        result = self._env.simulate(self._action(topology, injection))
+        rho: NDArray[Any] = result.observation[self._env.observation_slices["rho"]]
+        return np.inf if result.terminated else float(rho.max())
+
+    def _held(self) -> F32:
+        """The injection that leaves dispatch and curtailment as they are."""
+        layout = continuous_layout(self._grid)
+        values, n_gen = np.zeros(layout.size, np.float32), len(layout.redispatch)
+        limits = self._env.state.curtailment_limit[0][layout.curtail]
+        values[n_gen : n_gen + len(layout.curtail)] = np.minimum(limits - 1.0, 0.0)
+        return values
+
+    def _action(self, topology: int, injection: F64 | F32 | None) -> Action:
+        if self._dispatch is None:
+            return topology
+        values = self._held() if injection is None else injection
+        if self._search is None:
+            return values
+        return {"topology": topology, "injection": values}
+
+
+def is_at_reference(state: GridState) -> bool:
+    """Whether every line of row 0 is closed and every element on busbar 1."""
+    return bool((state.topo_vect[0] == 1).all())

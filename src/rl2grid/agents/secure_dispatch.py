@@ -1,0 +1,365 @@
+"""Redispatch, curtailment and storage that keep the grid secure: a linear programme (``docs/algorithms/planner.md``).
+
+Powers in MW. A *case* is the grid as it is, or after the loss of one line.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rl2grid.agents.contingencies import Contingencies
+from rl2grid.agents.dc_flow import DcPoint, buses, dc_point, is_connected, outage_factors, sensitivities
+from rl2grid.agents.dispatch import Control, control_positions, controls
+from rl2grid.agents.dispatch_programme import DispatchProgramme
+from rl2grid.arrays import F32, F64, I32
+from rl2grid.engines.native.what_if import WhatIf
+from rl2grid.grids import Grid
+from rl2grid.mdp.actions import ActionCatalogue, ActionKind, continuous_layout
+from rl2grid.mdp.state import GridState
+from rl2grid.powerflow.batch import Snapshot
+from rl2grid.powerflow.model import Network
+
+NORMAL_BOUND = 0.90
+"""Loading that is wanted at most of every line as the grid is."""
+OUTAGE_BOUND = 0.95
+"""The same after the loss of a line."""
+_SCREEN = 0.90
+"""Worst loading after an outage from which on it is a case of the programme."""
+_CASES = 8
+"""Outages in a programme at most."""
+_WATCHED = 0.85
+"""Loading from which on a line of a case has a row."""
+_NORMAL_WEIGHT = 20.0
+"""Price of the overload of a line, as a share of its limit, as the grid is; after an outage: the outage's weight."""
+_PRICE = 2e-4
+"""Of a MW of the cheapest control away from rest."""
+_LIMIT_PRICE = 1.0
+"""Of a MW that leaves the room that a generator has on the forecasts of the next hour."""
+_RESERVE = 0.85
+"""Share of a generator's ramp that an action may use up."""
+_HORIZONS = (1, 3, 6, 12)
+"""Steps ahead at which generators must be able to follow the series."""
+_TREND = 6
+"""Steps over which the trend is measured that goes on from the last forecast."""
+_RAMP_KEPT = 0.3
+"""Share of all ramps that is kept for the next step."""
+_KEPT, _KEPT_PER_STEP = 20.0, 2.0
+"""MW that are kept for later steps, and more for each step ahead."""
+_DRIFT = 0.1
+"""MW outside its room from which on a dispatch has drifted."""
+_LEAST_DRIFT_KEPT = 15.0
+_TABLES = 8
+"""Topologies of which sensitivities are kept."""
+_TRIFLE = 0.5
+"""MW of dispatch that cannot drift into trouble."""
+_AWAY = 0.1
+"""MW of dispatch, curtailment or storage that is as good as none."""
+_LEAST_LOADING, _LEAST_SHARE, _MOST_SHARE = 0.3, 0.6, 1.4
+"""Where the limit in MW is taken from the AC flow: from which loading, and how far from the limit as it is now."""
+_NO_ACTION = ActionCatalogue(
+    np.array([ActionKind.NOTHING], np.int8), np.zeros(1, np.int32), np.zeros((1, 1), np.uint64)
+)
+
+
+class _Case(NamedTuple):
+    weight: float
+    bound: float
+    share: F64  # [line] DC flow over limit, with its sign
+    effect: F64  # [line, control] change of that per MW
+
+
+class Series(NamedTuple):
+    """Production of the redispatchable generators before any dispatch."""
+
+    now: F64  # [gen] MW
+    ahead: F64  # [horizon, gen] MW
+
+
+class SecureDispatch:
+    """Plans what the controls inject in the next step.
+
+    Args:
+        grid: the grid.
+        network: its electrical model.
+        what_if: what solves the flows after outages.
+    """
+
+    def __init__(self, grid: Grid, network: Network, what_if: WhatIf) -> None:
+        self._grid, self._network, self._what_if = grid, network, what_if
+        self._layout = continuous_layout(grid)
+        self._positions = control_positions(grid)
+        self._history: list[F64] = []
+        self._tables: dict[bytes, F64] = {}
+
+    def reset(self) -> None:
+        """Forget the series of the last episode."""
+        self._history.clear()
+
+    def watch(self, state: GridState) -> None:
+        """Remember what the generators produce by the series; once a step."""
+        self._history.append(self._series_now(state))
+        del self._history[: -_TREND - 1]
+
+    def foreseen(self, state: GridState, forecast: F32) -> Series:
+        """The series of the redispatchable generators, now and at the horizons of the programme.
+
+        Args:
+            state: row 0 is the present.
+            forecast: production by the forecasts of the next steps, float32 [step, gen]; later ones follow the trend
+                of the last half hour.
+        """
+        now, gens = self._series_now(state), self._layout.redispatch
+        trend = np.zeros(len(gens))
+        if len(self._history) > 1:
+            trend = (self._history[-1] - self._history[0]) / (len(self._history) - 1)
+        known = forecast[:, gens].astype(np.float64)
+        least, most = np.minimum(state.gen_pmin[gens], now), np.maximum(state.gen_pmax[gens], now)
+        ahead = [
+            known[steps - 1] if steps <= len(known) else np.clip(known[-1] + (steps - len(known)) * trend, least, most)
+            for steps in _HORIZONS
+        ]
+        return Series(now, np.array(ahead))
+
+    def is_in_use(self, state: GridState) -> bool:
+        """Whether generators are dispatched by more than a trifle."""
+        return bool(np.abs(state.actual_dispatch[0]).max(initial=0.0) >= _TRIFLE)
+
+    def is_drifting(self, state: GridState, series: Series) -> bool:
+        """Whether the dispatch would leave what generators can do in the next hour, if it stayed as it is.
+
+        While targets are met nothing is solved again, so that series plus dispatch may leave the limits of a unit; or
+        all fall, or rise, faster than those that are left can.
+        """
+        gens = self._layout.redispatch
+        dispatch = state.actual_dispatch[0][gens].astype(np.float64)
+        least, most = self._room(state, series)
+        if bool(((dispatch < least - _DRIFT) | (dispatch > most + _DRIFT)).any()):
+            return True
+        pmin, pmax, ramp = state.gen_pmin[gens], state.gen_pmax[gens], state.gen_max_ramp_up[gens]
+        made = series.now + dispatch
+        steps = np.array((1, *_HORIZONS))
+        wanted = np.concatenate(([made.sum()], series.ahead.sum(axis=1) + dispatch.sum()))
+        kept = np.array([_RAMP_KEPT * float(ramp.sum()), *(_LEAST_DRIFT_KEPT for _ in _HORIZONS)])
+        lowest = np.maximum(pmin, made - steps[:, None] * ramp).sum(axis=1)
+        highest = np.minimum(pmax, made + steps[:, None] * ramp).sum(axis=1)
+        return bool(((lowest > wanted - kept) | (highest < wanted + kept)).any())
+
+    def plan(
+        self,
+        state: GridState,
+        point: Snapshot,
+        series: Series,
+        contingencies: Contingencies,
+        everything: bool,
+        steps: int = 1,
+    ) -> F64 | None:
+        """MW that each control should inject, float64 [control]; None: there is nothing to do.
+
+        Args:
+            state: row 0 is the present.
+            point: what is expected in the next step, after the topology action that is played with it.
+            series: of the redispatchable generators.
+            contingencies: outages after which no line should be overloaded.
+            everything: curtailment and storage may be used more than now; else only less.
+            steps: that the generators have to get there; see :meth:`next_step`.
+        """
+        control = self._allowed(state, controls(state, self._grid), everything, steps)
+        cases, needed = self._cases(state, point, contingencies)
+        away = np.abs(control.now - control.at_rest).max(initial=0.0) > _AWAY
+        away = away or np.abs(state.target_dispatch[0]).max(initial=0.0) > _AWAY
+        if not needed and not away:
+            return None
+        return self._solve(state, control, cases, series)
+
+    def next_step(self, state: GridState, planned: F64) -> F64:
+        """What every control injects in the next step on its way to what is planned, MW, float64 [control].
+
+        Generators go as far as their ramps let them; those that go up, or those that go down, wait for the others, so
+        that all changes sum to zero.
+        """
+        control, n_gen = controls(state, self._grid), len(self._layout.redispatch)
+        change = np.clip(planned, control.least, control.most) - control.now
+        excess = float(change.sum())
+        waiting = change[:n_gen] > 0 if excess > 0 else change[:n_gen] < 0
+        total = float(change[:n_gen][waiting].sum())
+        if abs(total) > abs(excess):
+            change[:n_gen][waiting] *= 1.0 - excess / total
+        return control.now + change
+
+    def _series_now(self, state: GridState) -> F64:
+        gens = self._layout.redispatch
+        series: F64 = state.gen_p[0][gens].astype(np.float64) - state.actual_dispatch[0][gens]
+        return series
+
+    def _allowed(self, state: GridState, control: Control, everything: bool, steps: int) -> Control:
+        """The controls as far as they may go in so many steps, with ramp kept in reserve."""
+        gens = self._layout.redispatch
+        n = len(gens)
+        least, most = control.least.copy(), control.most.copy()
+        if steps > 1:
+            series = self._series_now(state)
+            least[:n] = np.maximum(
+                control.now[:n] - steps * state.gen_max_ramp_down[gens], state.gen_pmin[gens] - series
+            )
+            most[:n] = np.minimum(control.now[:n] + steps * state.gen_max_ramp_up[gens], state.gen_pmax[gens] - series)
+        least[:n] = control.now[:n] + _RESERVE * (least[:n] - control.now[:n])
+        most[:n] = control.now[:n] + _RESERVE * (most[:n] - control.now[:n])
+        if not everything:
+            least[n:], most[n:] = np.minimum(control.now[n:], 0.0), np.maximum(control.now[n:], 0.0)
+        return control._replace(least=np.minimum(least, control.now), most=np.maximum(most, control.now))
+
+    def _room(self, state: GridState, series: Series) -> tuple[F64, F64]:
+        """Least and largest dispatch that keeps every generator within its limits in the next hour."""
+        gens = self._layout.redispatch
+        all_series = np.concatenate((series.now[None], series.ahead))
+        least = np.minimum(state.gen_pmin[gens] - all_series.min(axis=0), 0.0)
+        most = np.maximum(state.gen_pmax[gens] - all_series.max(axis=0), 0.0)
+        return least, most
+
+    def _cases(self, state: GridState, point: Snapshot, contingencies: Contingencies) -> tuple[list[_Case], bool]:
+        """What the programme watches, and whether anything of it is loaded too much."""
+        rho = np.zeros((1, self._grid.n_line), np.float32)
+        outcome = self._what_if.actions(point, _NO_ACTION, None, rho)
+        if outcome.verdict[0] != 0 or not is_connected(self._grid, point.topo_vect):
+            return [], False
+        dc = dc_point(state, 0, self._grid, self._network)._replace(
+            busbar=point.topo_vect, injection=self._injections(point)
+        )
+        table = self._sensitivities(dc)
+        bus = buses(self._grid, dc.busbar)
+        on = dc.busbar > 0
+        flow = table @ np.bincount(bus[on], dc.injection[on], 2 * self._grid.n_sub)
+        effect = table[:, bus[self._positions]]
+        cases = [_case(_NORMAL_WEIGHT, NORMAL_BOUND, flow, effect, rho[0], dc)]
+        after = self._outages(dc, bus, table, flow, effect, point, contingencies)
+        needed = float(rho.max()) > NORMAL_BOUND or any(worst > OUTAGE_BOUND for worst, _ in after)
+        return cases + [case for _, case in after], needed
+
+    def _sensitivities(self, dc: DcPoint) -> F64:
+        """Those of the topology, which seldom changes."""
+        key = dc.busbar.tobytes()
+        if key not in self._tables:
+            while len(self._tables) >= _TABLES:
+                del self._tables[next(iter(self._tables))]
+            self._tables[key] = sensitivities(self._grid, dc)
+        return self._tables[key]
+
+    def _injections(self, point: Snapshot) -> F64:
+        """MW into the grid by element of ``topo_vect``, as :class:`DcPoint` has them, balanced at the slack."""
+        grid = self._grid
+        injection = np.zeros(grid.dim_topo)
+        injection[grid.gen_pos_topo_vect] = point.gen_p
+        injection[grid.load_pos_topo_vect] = -point.load_p
+        injection[grid.storage_pos_topo_vect] = -point.storage_p
+        injection[grid.gen_pos_topo_vect[grid.slack_gen]] -= injection.sum()
+        return injection
+
+    def _outages(
+        self,
+        dc: DcPoint,
+        bus: I32,
+        table: F64,
+        flow: F64,
+        effect: F64,
+        point: Snapshot,
+        contingencies: Contingencies,
+    ) -> list[tuple[float, _Case]]:
+        """The worst loading after each outage that matters, and its case: flows change by outage factors."""
+        lines, grid = contingencies.lines, self._grid
+        if len(lines) == 0:
+            return []
+        rho = np.zeros((len(lines), grid.n_line), np.float32)
+        outcomes = self._what_if.outages(point, lines, rho)
+        worst = np.where(np.isfinite(outcomes.worst_loading), outcomes.worst_loading, 0.0).astype(np.float64)
+        matters = ~outcomes.was_open & (outcomes.verdict == 0) & (worst >= _SCREEN)
+        order = np.argsort(-np.where(matters, worst * contingencies.weight, -1.0), kind="stable")[:_CASES]
+        found = []
+        for k in order[matters[order]].tolist():
+            line = int(lines[k])
+            factor = outage_factors(grid, table, bus, line)
+            if factor is None:
+                continue
+            case = _case(
+                float(contingencies.weight[k]),
+                OUTAGE_BOUND,
+                flow + factor * flow[line],
+                effect + np.outer(factor, effect[line]),
+                rho[k],
+                dc,
+            )
+            found.append((float(worst[k]), case))
+        return found
+
+    def _solve(self, state: GridState, control: Control, cases: list[_Case], series: Series) -> F64 | None:
+        n_gen = len(self._layout.redispatch)
+        programme = DispatchProgramme(control, self._prices(state, control))
+        rows = [_overload_rows(case, control.now) for case in cases]
+        if rows:
+            effect, bound, weight = (np.concatenate(column) for column in zip(*rows, strict=True))
+            overload = programme.add(np.zeros(len(bound)), weight)
+            programme.at_most(effect, bound, (overload, -np.ones(len(bound))))
+        least, most = self._room(state, series)
+        outside = programme.add(np.zeros(n_gen), np.full(n_gen, _LIMIT_PRICE))
+        gens = np.eye(n_gen, len(control.now))
+        programme.at_most(gens, most, (outside, -np.ones(n_gen)))
+        programme.at_most(-gens, -least, (outside, -np.ones(n_gen)))
+        self._keep_ramps(programme, state, series)
+        return programme.solve()
+
+    def _prices(self, state: GridState, control: Control) -> F64:
+        """Per MW away from rest: cheaper where a ramp is wide, since many small steps would leave none."""
+        gens = self._layout.redispatch
+        price = _PRICE * control.price / max(float(control.price.min(initial=np.inf)), 1e-9)
+        ramp = state.gen_max_ramp_up[gens].astype(np.float64)
+        price[: len(gens)] *= ramp.mean() / np.maximum(ramp, 0.5)
+        return price
+
+    def _keep_ramps(self, programme: DispatchProgramme, state: GridState, series: Series) -> None:
+        """Ask that at every horizon all generators together can still fall, and rise, with some MW to spare.
+
+        What a generator can fall to at most, ``max(pmin, p + x - steps * ramp)``, is a column that is bounded from
+        below by both; their sum may exceed what the series asks for by nothing.
+        """
+        gens = self._layout.redispatch
+        pmin, pmax, ramp = (
+            each[gens].astype(np.float64) for each in (state.gen_pmin, state.gen_pmax, state.gen_max_ramp_up)
+        )
+        n, start = len(gens), series.ahead[0]
+        one = np.eye(n, programme.n_control)
+        total = np.ones((1, n)) @ one
+        for steps, wanted in zip(_HORIZONS, series.ahead.sum(axis=1).tolist(), strict=True):
+            later = max(steps, 2) - 1
+            kept = _RAMP_KEPT * float(ramp.sum()) if steps == 1 else _KEPT + _KEPT_PER_STEP * steps
+            for sign, limit in ((1.0, pmin), (-1.0, pmax)):  # falling, then rising: the same with signs changed
+                reach = start - sign * later * ramp
+                extreme = np.maximum(limit, reach) if sign > 0 else np.minimum(limit, reach)
+                spare = min(kept, max(sign * (wanted - float(extreme.sum())), 0.0))
+                column = programme.add(sign * limit, np.zeros(n))  # sign * the extreme production
+                missing = programme.add(np.zeros(1), np.ones(1))
+                programme.at_most(sign * one, -sign * reach, (column, -np.ones(n)))
+                programme.at_most(
+                    -sign * total,
+                    np.array([sign * wanted - spare]),
+                    (column, np.ones((1, n))),
+                    (missing, -np.ones(1)),
+                )
+
+
+def _case(weight: float, bound: float, flow: F64, effect: F64, rho: NDArray[np.float32], dc: DcPoint) -> _Case:
+    """A case in shares of the limits, which are those with which the DC flow meets the loadings of the AC flow."""
+    known = (rho > _LEAST_LOADING) & (np.abs(flow) > 1e-3)
+    limit = np.where(known, np.abs(flow) / np.maximum(rho, 0.05), dc.limit)
+    limit = np.clip(limit, _LEAST_SHARE * dc.limit, _MOST_SHARE * dc.limit)
+    return _Case(weight, bound, flow / limit, effect / limit[:, None])
+
+
+def _overload_rows(case: _Case, now: F64) -> tuple[F64, F64, F64]:
+    """``effect @ x <= bound + overload`` of the lines that matter: effect [row, control], bound and weight [row]."""
+    (watched,) = np.nonzero(np.abs(case.share) > min(_WATCHED, case.bound - 0.03))
+    sign = np.sign(case.share[watched])
+    effect = case.effect[watched] * sign[:, None]
+    unchanged = (case.share[watched] - case.effect[watched] @ now) * sign
+    return effect, case.bound - unchanged, np.full(len(watched), case.weight)

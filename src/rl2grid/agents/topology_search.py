@@ -1,0 +1,264 @@
+"""Search over sequences of topology actions on the forecasts (``docs/algorithms/planner.md``)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from rl2grid.agents.contingencies import Contingencies, danger
+from rl2grid.arrays import F32, F64, I32, Flags
+from rl2grid.engines.native.what_if import ActionOutcomes, WhatIf
+from rl2grid.envs.outages_after_action import busbars_after
+from rl2grid.grids import Grid
+from rl2grid.mdp.actions import ActionCatalogue, ActionKind, StepAction
+from rl2grid.powerflow.batch import Snapshot
+
+NOTHING = 0
+SAFE = 0.95
+"""Worst loading below which a sequence has reached what it was for."""
+_BEAM = (40, 30)
+"""Sequences that are gone on from after one step, and after more."""
+_WIDE = 320
+"""Actions of which every one is tried in later steps; of a larger catalogue the most promising ones of the first."""
+_LONGEST = 3
+"""Steps until the first trip that are looked at, and one more after it."""
+_CANDIDATES = 12
+"""Sequences that make the grid safe, of which the one is chosen that outages endanger least."""
+_OVERLOADS = 0.3
+"""What the sum of all overloads counts beside the worst loading."""
+_LARGEST_OVERLOAD = 2.0
+_TRIP = 3.0
+"""What it counts that protections would trip a line now."""
+_TRIPPED = 2.0
+"""What a line counts that they have tripped."""
+_CASCADE_ROUNDS = 12
+_DANGER = 2.0
+"""What the danger of outages counts beside the worst loading, between sequences that make the grid safe."""
+
+
+class Found(NamedTuple):
+    """Where the best sequence begins, and where it leads."""
+
+    action: int
+    """Entry of the catalogue that it begins with."""
+    worst_loading: float
+    """After its last step; infinite where the grid is lost on every way."""
+    n_actions: int
+    """Its steps."""
+    n_trips: int
+    """Lines that protections trip on the way."""
+
+
+class _Way(NamedTuple):
+    """A sequence of actions, and where it leads."""
+
+    first: int  # entry of the catalogue, -1: no action yet
+    point: Snapshot  # after the last action, with what protections have tripped
+    overflow: I32  # [line] steps above the limit
+    n_trips: int
+    worst: float
+    score: float
+
+
+class _Step(NamedTuple):
+    """One more action at the end of a way."""
+
+    score: float
+    worst: float
+    trips: bool  # protections would trip a line in the next step
+    way: _Way
+    action: int
+    overflow: I32
+    rho: F32
+
+
+_LOST = Found(NOTHING, np.inf, 0, 0)
+
+
+class TopologySearch:
+    """Looks for sequences that lead to a safe grid before protections trip a line, and for the least damage if none do.
+
+    Args:
+        grid: the grid.
+        catalogue: what may be played; entry 0 does nothing.
+        what_if: what solves the flows.
+        longest: steps until the first trip that are looked at; 0: one action alone.
+        seconds: after which no more sequences are tried; None: as long as it takes, which is bounded. Results depend
+            on the machine with it.
+    """
+
+    def __init__(
+        self,
+        grid: Grid,
+        catalogue: ActionCatalogue,
+        what_if: WhatIf,
+        longest: int = _LONGEST,
+        seconds: float | None = None,
+    ) -> None:
+        self._grid, self._catalogue, self._what_if = grid, catalogue, what_if
+        self._longest, self._seconds = longest, seconds
+        self._actions: dict[int, StepAction] = {}
+
+    def best(self, points: Sequence[Snapshot], overflow: I32, contingencies: Contingencies) -> Found:
+        """The first action of the best sequence.
+
+        Args:
+            points: forecasts for the next step and those after it, before anybody acts; the last one goes on.
+            overflow: steps that every line has been above its limit, int32 [line].
+            contingencies: outages to be ready for, once the grid is safe.
+        """
+        until = np.inf if self._seconds is None else time.perf_counter() + self._seconds
+        ways = [_Way(-1, points[0], overflow.astype(np.int32), 0, np.inf, 0.0)]
+        entries: I32 | None = None
+        best = _LOST
+        for depth in range(self._depth(overflow)):
+            steps = self._steps(ways, entries, _BEAM[min(depth, len(_BEAM) - 1)], until)
+            if not steps:
+                break
+            safe = [step for step in steps if not step.trips and step.way.n_trips == 0 and step.worst < SAFE]
+            if safe:
+                return self._safest(safe, depth + 1, contingencies)
+            if entries is None and len(self._catalogue) > _WIDE:
+                entries = np.array(sorted({NOTHING, *(step.action for step in steps[:_WIDE])}), np.int32)
+            point = points[min(depth + 1, len(points) - 1)]
+            ways = self._ways(steps, _BEAM[min(depth, len(_BEAM) - 1)], point)
+            if not ways:
+                break
+            best = Found(ways[0].first, ways[0].worst, depth + 1, ways[0].n_trips)
+            if time.perf_counter() > until:
+                break
+        return best
+
+    def after(self, point: Snapshot, action: int) -> Snapshot:
+        """The operating point after an action."""
+        played = self._action(action)
+        topology = busbars_after(self._grid, point.topo_vect, point.last_bus, played)
+        return point._replace(
+            topo_vect=topology, last_bus=np.where(topology > 0, topology, point.last_bus).astype(np.int32)
+        )
+
+    def outcomes(self, point: Snapshot, entries: I32 | None = None) -> tuple[ActionOutcomes, F32]:
+        """What every action would do, and the loadings after it, float32 [action, line]."""
+        n = len(self._catalogue) if entries is None else len(entries)
+        rho = np.zeros((n, self._grid.n_line), np.float32)
+        return self._what_if.actions(point, self._catalogue, entries, rho), rho
+
+    def _depth(self, overflow: I32) -> int:
+        if self._longest == 0:
+            return 1
+        left = self._grid.rules.overflow_allowed + 1 - int(overflow.max(initial=0))
+        return max(1, min(left, self._longest)) + 1
+
+    def _steps(self, ways: list[_Way], entries: I32 | None, beam: int, until: float) -> list[_Step]:
+        """The best next actions of all ways, the best first."""
+        found: list[_Step] = []
+        for way in ways:
+            if found and time.perf_counter() > until:
+                break
+            found += self._next_actions(way, entries, _WIDE if way.first < 0 else beam)
+        return sorted(found, key=lambda step: step.score)
+
+    def _next_actions(self, way: _Way, entries: I32 | None, most: int) -> list[_Step]:
+        outcomes, rho = self.outcomes(way.point, entries)
+        playable = outcomes.legal & np.isfinite(outcomes.worst_loading)
+        worst = np.where(playable, outcomes.worst_loading, np.inf).astype(np.float64)
+        rho[~playable] = 0.0
+        overflow = np.where(rho > 1.0, way.overflow[None, :] + 1, 0).astype(np.int32)
+        trips: Flags = np.any(self._trips(rho, overflow), axis=1)
+        overloads = np.clip(rho - 1.0, 0.0, _LARGEST_OVERLOAD).sum(axis=1)
+        score: F64 = worst + _OVERLOADS * overloads + _TRIP * trips + _TRIPPED * way.n_trips
+        order = np.argsort(score, kind="stable")[:most]
+        return [
+            _Step(
+                float(score[k]),
+                float(worst[k]),
+                bool(trips[k]),
+                way,
+                int(k if entries is None else entries[k]),
+                overflow[k],
+                rho[k],
+            )
+            for k in order.tolist()
+            if np.isfinite(score[k])
+        ]
+
+    def _trips(self, rho: F32, overflow: I32) -> Flags:
+        """Lines that protections trip: too long above the limit, or too far."""
+        rules = self._grid.rules
+        trips: Flags = (overflow > rules.overflow_allowed) | (rho > rules.hard_overflow)
+        return trips
+
+    def _ways(self, steps: list[_Step], beam: int, point: Snapshot) -> list[_Way]:
+        """Where the best steps lead, the best first; of those that trip lines, those that leave a grid."""
+        unhurt = any(not step.trips for step in steps[:beam])
+        ways = []
+        for step in steps[: beam if unhurt else max(beam, _BEAM[0])]:
+            way = self._followed(step, point)
+            if way is not None:
+                ways.append(way)
+        return sorted(ways, key=lambda way: way.score)[:beam]
+
+    def _followed(self, step: _Step, point: Snapshot) -> _Way | None:
+        """The way that a step leads on, a step later; None where the cascade leaves no grid."""
+        first = step.way.first if step.way.first >= 0 else step.action
+        after = self._cooled(self.after(step.way.point, step.action), step.action)
+        rho, overflow, n_trips = step.rho, step.overflow, 0
+        for _ in range(_CASCADE_ROUNDS):
+            tripped = np.flatnonzero(self._trips(rho, overflow) & (rho > 0.0))
+            if len(tripped) == 0:
+                break
+            n_trips += len(tripped)
+            after = self._without(after, tripped)
+            outcomes, all_rho = self.outcomes(after, np.zeros(1, np.int32))
+            if outcomes.verdict[0] != 0:
+                return None
+            rho = all_rho[0]
+            overflow = np.where(rho > 1.0, np.maximum(overflow, 1), 0).astype(np.int32)
+            overflow[tripped] = 0
+        worst, n_trips = float(rho.max()), step.way.n_trips + n_trips
+        overloads = float(np.clip(rho - 1.0, 0.0, _LARGEST_OVERLOAD).sum())
+        topology = {name: getattr(after, name) for name in ("topo_vect", "last_bus", "cooldown_line", "cooldown_sub")}
+        score = worst + _OVERLOADS * overloads + _TRIPPED * n_trips
+        return _Way(first, point._replace(**topology), overflow, n_trips, worst, score)
+
+    def _cooled(self, point: Snapshot, action: int) -> Snapshot:
+        """A step later: cooldowns have run on, and what was changed cools down."""
+        line, sub = np.maximum(point.cooldown_line - 1, 0), np.maximum(point.cooldown_sub - 1, 0)
+        for change in self._action(action).changes:
+            if change.kind == ActionKind.SWITCH:
+                line[change.target] = max(int(line[change.target]), self._grid.rules.cooldown_line)
+            else:
+                sub[change.target] = max(int(sub[change.target]), self._grid.rules.cooldown_sub)
+        return point._replace(cooldown_line=line, cooldown_sub=sub)
+
+    def _without(self, point: Snapshot, lines: np.ndarray[tuple[int], np.dtype[np.int64]]) -> Snapshot:
+        topology, cooldown = point.topo_vect.copy(), point.cooldown_line.copy()
+        topology[self._grid.line_or_pos_topo_vect[lines]] = -1
+        topology[self._grid.line_ex_pos_topo_vect[lines]] = -1
+        cooldown[lines] = self._grid.rules.reconnection
+        return point._replace(topo_vect=topology, cooldown_line=cooldown)
+
+    def _safest(self, safe: list[_Step], n_actions: int, contingencies: Contingencies) -> Found:
+        """Of the sequences that make the grid safe, the one that outages endanger least."""
+
+        def first(step: _Step) -> int:
+            return step.way.first if step.way.first >= 0 else step.action
+
+        best = safe[0]
+        if len(contingencies.lines) and len(safe) > 1:
+            candidates = safe[:_CANDIDATES]
+            best = min(
+                candidates,
+                key=lambda step: (
+                    _DANGER * danger(self._what_if, self.after(step.way.point, step.action), contingencies) + step.worst
+                ),
+            )
+        return Found(first(best), best.worst, n_actions, 0)
+
+    def _action(self, entry: int) -> StepAction:
+        if entry not in self._actions:
+            self._actions[entry] = self._catalogue[entry]
+        return self._actions[entry]

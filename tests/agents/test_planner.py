@@ -1,0 +1,135 @@
+"""The planner on all kinds of task: what it reaches, what it refuses, and that nothing but the seed decides."""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+import rl2grid  # noqa: F401  (registers the tasks)
+from rl2grid.agents.agent import no_intervention
+from rl2grid.agents.planner import INGREDIENTS, Planner
+from rl2grid.errors import UsageError
+from rl2grid.evaluation.agents import AGENTS, kinds_of, make_agent
+
+DAYS = 2 * 288
+
+
+def environment(task: str, **keywords: Any) -> Any:
+    keywords = {"split": "bundled", "disable_env_checker": True, **keywords}
+    return gymnasium.make(f"rl2grid/{task}-v0", **keywords)
+
+
+def play(agent: Any, env: Any, seed: int = 0, steps: int = DAYS) -> tuple[list[Any], float, dict[str, Any]]:
+    """Actions, survival and the last info of an episode, or of its first steps."""
+    agent.bind(env)
+    observation, info = env.reset(seed=seed)
+    agent.reset(0)
+    actions, over = [], False
+    while not over and len(actions) < steps:
+        actions.append(agent.act(observation, info))
+        observation, _, terminated, truncated, info = env.step(actions[-1])
+        over = terminated or truncated
+    return actions, float(info["survival"]), info
+
+
+class Nothing:
+    def bind(self, env: Any) -> None:
+        self._action = no_intervention(env.action_space)
+
+    def reset(self, i: int) -> None:
+        pass
+
+    def act(self, observation: Any, info: Any) -> Any:
+        return self._action
+
+
+@pytest.mark.parametrize("task", ["bus36-MO-v0-T0", "bus36-MO-v0-H0"])
+def test_survives_attacks_that_end_doing_nothing(task):
+    nothing = play(Nothing(), environment(task), seed=3)[1]
+    assert play(Planner(), environment(task), seed=3)[1] > 1.5 * nothing
+
+
+@pytest.mark.parametrize("task", ["bus14-T0", "bus118-M-H0"])
+def test_survives_what_doing_nothing_survives(task):
+    nothing = play(Nothing(), environment(task))[1]
+    assert play(Planner(), environment(task))[1] >= nothing
+
+
+def test_actions_of_every_kind_of_task_are_of_its_space():
+    for task in ("bus14-T0", "bus14-R", "bus14-H0"):
+        env = environment(task, episode_length=48)
+        actions, _, info = play(Planner(), env)
+        assert all(env.action_space.contains(action) for action in actions)
+        assert not info["illegal"]
+        assert not info["ambiguous"]
+
+
+def test_prevention_shifts_power_while_the_grid_is_safe():
+    env = environment("bus36-MO-v0-H0", opponent=True)
+    play(Planner(), env, steps=60)
+    shifted = float(np.abs(env.unwrapped.state.actual_dispatch[0]).sum())
+    other = environment("bus36-MO-v0-H0", opponent=True)
+    play(Planner(without=["prevention"]), other, steps=60)
+    assert shifted > 10.0
+    assert shifted > 2 * float(np.abs(other.unwrapped.state.actual_dispatch[0]).sum())
+
+
+def test_the_same_seed_gives_the_same_actions_and_asking_leaves_the_episode_as_it_is():
+    first = play(Planner(), environment("bus36-MO-v0-H0"), seed=4, steps=80)
+    again = play(Planner(), environment("bus36-MO-v0-H0"), seed=4, steps=80)
+    for one, other in zip(first[0], again[0], strict=True):
+        assert one["topology"] == other["topology"]
+        np.testing.assert_array_equal(one["injection"], other["injection"])
+    assert first[1] == again[1]
+
+
+def test_curtailment_stays_as_it_is_while_nothing_is_planned():
+    env = environment("bus14-R")
+    agent = Planner()
+    agent.bind(env)
+    env.reset(seed=0, options={"start": 140})
+    agent.reset(0)
+    limits = np.zeros(env.action_space.shape, np.float32)
+    limits[3:] = -0.9
+    env.step(limits)
+    state = env.unwrapped.state
+    kept = state.curtailment_limit[0].copy()
+    action = agent._held()
+    env.step(action)
+    np.testing.assert_allclose(state.curtailment_limit[0], kept, atol=1e-6)
+
+
+def test_it_says_why():
+    env = environment("bus36-MO-v0-T0")
+    agent = Planner()
+    play(agent, env)
+    considered = agent.explain()
+    assert considered is not None
+    assert "%" in considered.why or "safe" in considered.why
+
+
+def test_ingredients_are_left_out_by_name():
+    assert Planner(without=["danger", "sequences"]).name == "planner without danger without sequences"
+    with pytest.raises(UsageError, match=r"Ingredient 'luck'.*sequences"):
+        Planner(without=["luck"])
+    assert set(INGREDIENTS) == {"sequences", "danger", "restoring", "prevention", "dispatch first"}
+    for each in INGREDIENTS:
+        play(Planner(without=[each]), environment("bus36-MO-v0-H0"), steps=5)
+
+
+def test_the_seconds_of_a_search_are_positive():
+    assert Planner(seconds=0.5).name == "planner (0.5 s)"
+    with pytest.raises(UsageError, match="seconds=0 is not allowed"):
+        Planner(seconds=0)
+
+
+def test_the_reference_engine_answers_no_what_if():
+    with pytest.raises(UsageError, match='engine="native"'):
+        Planner().bind(environment("bus14-T0", engine="reference"))
+
+
+def test_it_is_found_by_name():
+    assert isinstance(make_agent("planner"), Planner)
+    assert "planner" in AGENTS
+    assert kinds_of("planner") == ("T", "R", "H")
