@@ -95,6 +95,19 @@ def test_changes_on_the_way_to_a_plan_sum_to_zero_and_keep_to_ramps():
         assert (after <= control.most + 1e-9).all()
 
 
+def test_curtailed_renewables_come_back_slowly():
+    env = standing("bus36-MO-v0-R", opponent=False)
+    layout = continuous_layout(env.grid)
+    n_gen = len(layout.redispatch)
+    env.state.gen_p_before_curtail[0][layout.curtail] = env.state.gen_p[0][layout.curtail] + 5.0
+    dispatch, control = dispatch_of(env), controls(env.state, env.grid)
+    curtailed = -control.now[n_gen:].sum()
+    ramp = float(env.state.gen_max_ramp_down[layout.redispatch].sum())
+    back = (dispatch.next_step(env.state, control.at_rest) - control.now)[n_gen:].sum()
+    assert curtailed > 0.25 * ramp
+    np.testing.assert_allclose(back, 0.25 * ramp, rtol=1e-6)
+
+
 def test_a_dispatch_outside_of_what_generators_can_do_has_drifted():
     env = standing("bus14-R")
     dispatch = dispatch_of(env)

@@ -40,6 +40,8 @@ _LIMIT_PRICE = 1.0
 """Of a MW that leaves the room that a generator has on the forecasts of the next hour."""
 _RESERVE = 0.85
 """Share of a generator's ramp that an action may use up."""
+_RETURN_SHARE = 0.25
+"""Of the ramp of all generators: what returning renewables may ask of it in a step."""
 _HORIZONS = (1, 3, 6, 12)
 """Steps ahead at which generators must be able to follow the series."""
 _TREND = 6
@@ -180,7 +182,7 @@ class SecureDispatch:
         Generators go as far as their ramps let them; those that go up, or those that go down, wait for the others, so
         that all changes sum to zero.
         """
-        control, n_gen = controls(state, self._grid), len(self._layout.redispatch)
+        control, n_gen = self._returning(controls(state, self._grid), state, 1), len(self._layout.redispatch)
         change = np.clip(planned, control.least, control.most) - control.now
         excess = float(change.sum())
         waiting = change[:n_gen] > 0 if excess > 0 else change[:n_gen] < 0
@@ -198,6 +200,7 @@ class SecureDispatch:
         """The controls as far as they may go in so many steps, with ramp kept in reserve."""
         gens = self._layout.redispatch
         n = len(gens)
+        control = self._returning(control, state, steps)
         least, most = control.least.copy(), control.most.copy()
         if steps > 1:
             series = self._series_now(state)
@@ -210,6 +213,16 @@ class SecureDispatch:
         if not everything:
             least[n:], most[n:] = np.minimum(control.now[n:], 0.0), np.maximum(control.now[n:], 0.0)
         return control._replace(least=np.minimum(least, control.now), most=np.maximum(most, control.now))
+
+    def _returning(self, control: Control, state: GridState, steps: int) -> Control:
+        """Curtailed renewables come back slowly: generators must follow, and more may be there than was forecast."""
+        first = len(self._layout.redispatch)
+        renewable = slice(first, first + len(self._layout.curtail))
+        curtailed = -float(control.now[renewable].sum())
+        budget = _RETURN_SHARE * steps * float(state.gen_max_ramp_down[self._layout.redispatch].sum())
+        most = control.most.copy()
+        most[renewable] = control.now[renewable] * (1.0 - min(budget / max(curtailed, 1e-9), 1.0))
+        return control._replace(most=most)
 
     def _room(self, state: GridState, series: Series) -> tuple[F64, F64]:
         """Least and largest dispatch that keeps every generator within its limits in the next hour."""
