@@ -69,5 +69,5 @@ def test_what_was_dispatched_is_given_back():
 
 
 def test_actions_can_be_named_on_topology_tasks_only():
-    with pytest.raises(UsageError, match="on topology and joint tasks"):
+    with pytest.raises(UsageError, match="on topology tasks"):
         Greedy([1, 2]).bind(gymnasium.make("rl2grid/bus14-R-v0", disable_env_checker=True))

@@ -11,10 +11,13 @@ from rl2grid.errors import UsageError
 
 TOLERANCE = 1e-5
 """Relative, of sums in float64 over features that were divided and multiplied by their scale in float32."""
-TASKS = ("bus14-T1", "bus36-MO-v0-T1", "bus118-MOB-v1-T0", "bus14-R", "bus36-MO-v0-R", "bus118-MOB-v1-R")
+TASKS = ("bus14-T1", "bus36-MO-v0-T1", "bus118-MOB-v1-T0", "bus14-R", "bus36-MO-v0-R", "bus118-MOB-v1-R", "bus14-H1")
 
 
 def act(env, random):
+    if isinstance(env.action_space, gymnasium.spaces.Dict):
+        values = random.uniform(-0.02, 0.02, env.unwrapped.task.n_injections).astype(np.float32)
+        return {"topology": int(random.choice(np.flatnonzero(env.unwrapped.action_masks()))), "injection": values}
     if isinstance(env.action_space, gymnasium.spaces.Discrete):
         return int(random.choice(np.flatnonzero(env.unwrapped.action_masks())))
     return random.uniform(-0.02, 0.02, env.action_space.shape).astype(np.float32)

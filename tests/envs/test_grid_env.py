@@ -40,7 +40,7 @@ def checked(task_id, engine):
         ("reference", "bus36-MO-v0"),
     ],
 )
-@pytest.mark.parametrize("kind", ["T0", "R"])
+@pytest.mark.parametrize("kind", ["T0", "R", "H0"])
 def test_passes_the_environment_checker(engine, grid_id, kind):
     """A grid without opponent and one with; the longer test below checks all tasks."""
     checked(f"rl2grid/{grid_id}-{kind}-v0", engine)

@@ -167,3 +167,16 @@ def test_stable_baselines3_learns_a_few_steps():
     model.learn(16)
     action, _ = model.predict(env.reset(seed=0)[0])
     env.step(action)
+
+
+@pytest.mark.parametrize("wrapper", [VectorJointAsBox, VectorJointAsDiscrete])
+def test_our_algorithms_learn_a_few_steps(wrapper):
+    pytest.importorskip("torch")
+    from rl2grid.algorithms.ppo import PPO, Args
+
+    masks = wrapper is VectorJointAsDiscrete
+    args = Args(total_timesteps=8, num_envs=2, num_steps=4, num_minibatches=1, update_epochs=1, mask_actions=masks)
+    ppo = PPO(args, wrapper(make_vector(2)))
+    assert ppo.iterate()
+    with pytest.raises(UsageError, match="wrap the environments in VectorJointAsBox or VectorJointAsDiscrete"):
+        PPO(args, make_vector(2))

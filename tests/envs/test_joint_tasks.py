@@ -79,10 +79,16 @@ def test_on_grid2op_dispatch_too():
 
 
 @pytest.mark.parametrize(
-    "heuristic", [None, *(pytest.param(name, marks=pytest.mark.slow) for name in ("recovery", "careful"))]
+    ("task", "heuristic"),
+    [
+        ("bus14-H1", None),
+        pytest.param("bus14-H1", "recovery", marks=pytest.mark.slow),
+        pytest.param("bus14-H1", "careful", marks=pytest.mark.slow),
+        pytest.param(f"{STORAGE_GRID}-H0", None, marks=pytest.mark.slow),
+    ],
 )
-def test_engines_agree_on_random_joint_actions(heuristic):
-    engines = [make("bus14-H1", engine=engine, heuristic=heuristic) for engine in ("reference", "native")]
+def test_engines_agree_on_random_joint_actions(task, heuristic):
+    engines = [make(task, engine=engine, heuristic=heuristic) for engine in ("reference", "native")]
     random = np.random.default_rng(5)
     for env in engines:
         env.reset(seed=1)

@@ -58,7 +58,7 @@ def test_a_game_over_is_drawn_with_its_topology_and_told(rendered):
     assert rendered.render().shape == (720, 1280, 3)
 
 
-@pytest.mark.parametrize("kind", ["T0", "R"])
+@pytest.mark.parametrize("kind", ["T0", "R", "H0"])
 def test_passes_the_checker_with_pictures(kind):
     environment = make(f"bus14-{kind}", render_mode="rgb_array", disable_env_checker=True)
     with warnings.catch_warnings():

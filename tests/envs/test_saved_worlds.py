@@ -30,6 +30,10 @@ def action_of(env: Any, k: int) -> Any:
     random, space = np.random.default_rng(k), env.action_space
     if isinstance(space, gymnasium.spaces.Discrete):
         return int(random.integers(space.n)) if k % 2 else 0
+    if isinstance(space, gymnasium.spaces.Dict):
+        topology = int(random.integers(env.task.n_topology_actions)) if k % 2 else 0
+        values = random.uniform(-0.3, 0.3, env.task.n_injections) if k % 3 else np.zeros(env.task.n_injections)
+        return {"topology": topology, "injection": values.astype(np.float32)}
     values = random.uniform(-0.3, 0.3, space.shape) if k % 2 else np.zeros(space.shape)
     return values.astype(np.float32)
 
@@ -61,6 +65,7 @@ def two_days() -> dict[str, Any]:
         ("bus14-T0", {}),
         ("bus14-T0", {"heuristic": "idle", "gamma": 0.9}),
         ("bus14-R", {"heuristic": "recovery"}),
+        ("bus14-H0", {"heuristic": "recovery"}),
         ("bus36-MO-v0-T0", {"heuristic": "careful", "split": "validation"}),
         ("bus36-MO-v1-R", {"dispatch": "grid2op"}),
         ("bus118-MOB-v1-T0", {"normalize": None}),

@@ -19,7 +19,7 @@ from rl2grid.grids import GRID_IDS
 from rl2grid.mdp.actions import DO_NOTHING, ActionCatalogue, ContinuousLayout
 from rl2grid.mdp.features import physical_scale
 
-TASKS = [f"{grid}-{kind}" for grid in GRID_IDS for kind in ("T0", "R")]
+TASKS = [f"{grid}-{kind}" for grid in GRID_IDS for kind in ("T0", "R", "H0")]
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -40,7 +40,7 @@ def test_every_entry_of_an_observation_is_of_an_element(name: str):
     for feature in spec.features:
         assert feature.end - feature.begin == counts[feature.of], feature
     assert spec.grid is grid
-    assert spec.continuous == (task.kind == "R")
+    assert spec.continuous == (task.kind != "T")
 
 
 def test_actions_are_those_of_the_task():
@@ -73,7 +73,7 @@ def same(one: Spec, other: Spec) -> bool:
     return pickle.dumps(one) == pickle.dumps(other)
 
 
-@pytest.mark.parametrize("name", ["bus14-T0", "bus14-R"])
+@pytest.mark.parametrize("name", ["bus14-T0", "bus14-R", "bus14-H0"])
 def test_it_is_small_survives_a_pickle_and_comes_back_from_plain_values(name: str):
     spec = task_spec(find_task(name), None)
     stored = pickle.dumps(spec)

@@ -44,7 +44,7 @@ def test_an_episode_lost_inside_reset_is_recorded():
 
 def test_joint_actions_are_told_in_words_with_what_they_promised():
     register_all()
-    env = gymnasium.make("rl2grid/bus14-H0-v0", disable_env_checker=True, heuristic="idle")
+    env = gymnasium.make("rl2grid/bus14-H0-v0", disable_env_checker=True, heuristic="idle", split="validation")
     agent = Greedy()
     agent.bind(env)
     recorded = record_episode(agent, env, scenario=list_scenarios("bus14", "validation")[0], steps=600)
@@ -52,9 +52,9 @@ def test_joint_actions_are_told_in_words_with_what_they_promised():
     assert acts
     assert all("redispatch" in words or "substation" in words or "line" in words for words in acts)
     for reason in recorded.reasons:
-        (chosen,) = (each for each in reason.alternatives if each.played)
+        (chosen,) = (each for each in reason.alternatives if each.chosen)
         assert np.isfinite(chosen.promised)
-        assert any(each.words == "" for each in reason.alternatives)  # doing nothing is always among them
+        assert any(each.action == "" for each in reason.alternatives)  # doing nothing is always among them
 
 
 @pytest.mark.parametrize("engine", ENGINES)

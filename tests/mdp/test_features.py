@@ -21,6 +21,7 @@ SPECIFIC = {
         "curtailment_limit",
     ],
 }
+SPECIFIC["H"] = SPECIFIC["T"] + SPECIFIC["R"]
 MAINTENANCE = ["time_next_maintenance", "duration_next_maintenance"]
 STORAGE = ["storage_charge", "storage_power_target", "storage_power", "storage_theta"]
 
@@ -38,7 +39,7 @@ def scale_of(grid_id, kind, feature):
     return shift[where], scale[where]
 
 
-@pytest.mark.parametrize("kind", ["T", "R"])
+@pytest.mark.parametrize("kind", ["T", "R", "H"])
 @pytest.mark.parametrize("grid_id", GRID_IDS)
 def test_features_follow_the_published_order_without_gaps(grid_id, kind):
     grid = load_grid(grid_id)
@@ -49,13 +50,13 @@ def test_features_follow_the_published_order_without_gaps(grid_id, kind):
     assert ends[-1] == observation_size(grid, kind)
 
 
-@pytest.mark.parametrize(("grid_id", "kind", "size"), [("bus14", "T", 226), ("bus14", "R", 157)])
+@pytest.mark.parametrize(("grid_id", "kind", "size"), [("bus14", "T", 226), ("bus14", "R", 157), ("bus14", "H", 268)])
 def test_sizes_counted_by_hand(grid_id, kind, size):
     # 1 + 2*6 gens + 2*11 loads + 2*20 lines + (57 elements + 2*20 + 14 subs | 7*6 gens) + 2*20 lines
     assert observation_size(load_grid(grid_id), kind) == size
 
 
-@pytest.mark.parametrize("kind", ["T", "R"])
+@pytest.mark.parametrize("kind", ["T", "R", "H"])
 def test_every_entry_is_the_attribute_of_its_name(grid, random_rows, kind):
     for i in range(len(random_rows.step)):
         observation = written(grid, kind, random_rows, i)
@@ -68,7 +69,7 @@ def test_every_entry_is_the_attribute_of_its_name(grid, random_rows, kind):
             np.testing.assert_array_equal(observation[place], expected, err_msg=name)
 
 
-@pytest.mark.parametrize("kind", ["T", "R"])
+@pytest.mark.parametrize("kind", ["T", "R", "H"])
 @pytest.mark.parametrize("grid_id", GRID_IDS)
 def test_physical_constants_are_positive_and_finite(grid_id, kind):
     grid = load_grid(grid_id)
@@ -80,7 +81,7 @@ def test_physical_constants_are_positive_and_finite(grid_id, kind):
     assert (scale > 0).all()
 
 
-@pytest.mark.parametrize("kind", ["T", "R"])
+@pytest.mark.parametrize("kind", ["T", "R", "H"])
 def test_scaled_observations_are_of_order_one(grid, random_rows, kind):
     shift, scale = physical_scale(grid, kind)
     for i in np.flatnonzero(~random_rows.terminated):

@@ -54,7 +54,7 @@ def evaluate():
         for function in SCALARS:
             values = [np.atleast_1d(function(state, i)) for i in range(ROWS)]
             results[f"{grid_id} {function.__name__}"] = np.array(values, np.float64)
-        for kind in ("T", "R"):
+        for kind in ("T", "R", "H"):
             observations = np.zeros((ROWS, observation_size(grid, kind)), np.float32)
             for i in range(ROWS):
                 observation_writer(kind)(state, i, observations[i])
