@@ -103,6 +103,11 @@ def test_a_vector_plays_what_single_environments_play(single, several):
     observations, _ = vector.reset(seed=2)
     np.testing.assert_array_equal(observations, [env.reset(seed=2 + i)[0] for i, env in enumerate(singles)])
     vector.action_space.seed(1)
+    vector.step(vector.action_space.sample())
+    began = vector.state_dict()
+    vector.reset(seed=7)
+    vector.load_state_dict(began)
+    vector.reset(seed=2)
     for _ in range(4):
         actions = vector.action_space.sample()
         _, rewards, *_ = vector.step(actions)

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from toy_runs import SMALL, request, toy_envs
 
+from rl2grid.algorithms.registry import algorithms_for
 from rl2grid.envs.tasks import find_task
 from rl2grid.errors import UsageError
 from rl2grid.training.request import RunArgs, find_limits, hyperparameters, read_config
@@ -69,9 +70,12 @@ def test_an_algorithm_that_cannot_learn_the_task_is_refused():
         hyperparameters("td3", "bus14-T0")
 
 
-def test_joint_tasks_are_learned_flattened():
-    with pytest.raises(UsageError, match=r"bus14-H0-v0 .* joint actions: .* VectorJointAsBox or VectorJointAsDiscrete"):
-        hyperparameters("ppo", "bus14-H0")
+def test_all_algorithms_learn_joint_tasks_with_the_actions_that_they_know():
+    masked = {name: getattr(hyperparameters(name, "bus14-H0"), "mask_actions", None) for name in algorithms_for("H")}
+    topology = {name: hyperparameters(name, "bus14-T0").mask_actions for name in algorithms_for("T")}
+    assert masked.keys() >= {"ppo", "lagrangian-ppo", "dqn", "sac", "td3"}
+    assert {name: masked[name] for name in topology} == topology
+    assert hyperparameters("td3", "bus14-H0") == hyperparameters("td3", "bus14-R")
 
 
 def test_unknown_presets_and_hyperparameters_are_refused():

@@ -16,6 +16,7 @@ import torch
 from rl2grid.agents.agent import Action, Considered, Info, Observation
 from rl2grid.algorithms.checkpoint import load_checkpoint
 from rl2grid.algorithms.registry import find_algorithm
+from rl2grid.envs.joint import JointAsBox, JointAsDiscrete
 from rl2grid.envs.normalization import ObservationNormalizer
 from rl2grid.envs.options import changed_options
 from rl2grid.envs.tasks import Task, find_task
@@ -79,7 +80,6 @@ class PolicyAgent:
             UsageError: its observations or actions are not those that the policy was trained with.
         """
         base: Any = env.unwrapped
-        self._env = base
         task = base.task.id
         if task != self.task:
             raise UsageError(f"The policy was trained on task {self.task!r} and cannot play task {task!r}.")
@@ -89,7 +89,11 @@ class PolicyAgent:
                 f"The policy was trained with normalize={trained!r} and cannot read observations of "
                 f"normalize={offered!r}: make the environment with the former."
             )
+        self._flattened = _flattened(env, self._network.continuous)
+        self._env: Any = self._flattened or base
         size = env.observation_space.shape
+        if self._flattened is not None:
+            env = self._flattened
         actions = env.action_space.shape[0] if self._network.continuous else env.action_space.n  # type: ignore
         if size != (self._network.observation_size,) or actions != self._network.action_size:
             raise UsageError(
@@ -106,7 +110,7 @@ class PolicyAgent:
         self._generator.manual_seed(Stream(seed, episode, Purpose.AGENT).integer(2**53))
 
     def act(self, observation: Observation, info: Info) -> Action:
-        """The action for an observation: its id, or float32 [dimensions] in [-1, 1]."""
+        """The action for an observation: its id, or float32 [dimensions] in [-1, 1], or a joint action."""
         if self._normalizer is not None:
             observation = self._normalizer.normalize(observation)
         masks = torch.as_tensor(self._env.action_masks()).unsqueeze(0) if self._mask_actions else None
@@ -115,8 +119,12 @@ class PolicyAgent:
             actions = self._network.act(observations, masks, None if self.deterministic else self._generator)
         self._seen = observations, masks
         if self._network.continuous:
-            return actions[0].clamp(-1.0, 1.0).numpy()
-        return int(actions[0])
+            return self._as_action(actions[0].clamp(-1.0, 1.0).numpy())
+        return self._as_action(int(actions[0]))
+
+    def _as_action(self, action: Action) -> Action:
+        """What the environment takes, of an action that the policy knows."""
+        return action if self._flattened is None else self._flattened.action(action)
 
     def explain(self) -> Considered | None:
         """The best actions of the last decision by the policy's probabilities or values; None if they are continuous.
@@ -129,7 +137,15 @@ class PolicyAgent:
         with torch.no_grad():
             values = self._network.preferences(*self._seen)[0]
         best = values.topk(min(_EXPLAINED, len(values)))
-        return Considered(self._network.preference, best.indices.tolist(), best.values.tolist())
+        actions = [self._as_action(action) for action in best.indices.tolist()]
+        return Considered(self._network.preference, actions, best.values.tolist())
+
+
+def _flattened(env: gymnasium.Env[Any, Any], continuous: bool) -> JointAsBox | JointAsDiscrete | None:
+    """A joint task as a policy plays it; None: a task with one kind of action."""
+    if not isinstance(env.action_space, gymnasium.spaces.Dict):
+        return None
+    return JointAsBox(env) if continuous else JointAsDiscrete(env)
 
 
 def load_agent(

@@ -66,7 +66,8 @@ class Algorithm:
     trainer: Callable[[Any, VectorEnvironment], Trainer]
     """Made of hyperparameters and environments."""
     kinds: tuple[str, ...]
-    """Kinds of task that it can learn: ``"T"`` (discrete actions), ``"R"`` (continuous actions)."""
+    """Kinds of task that it can learn: ``"T"`` (discrete actions), ``"R"`` (continuous actions). Joint tasks it learns
+    flattened, see :meth:`plays_continuous`."""
     preset: Callable[..., Any]
     """``preset(name, continuous=..., **changes)``: hyperparameters."""
     load_policy: Callable[[Mapping[str, Any]], Any]
@@ -76,6 +77,18 @@ class Algorithm:
     find_limits: Callable[[Any, str | None], dict[str, float]] | None = None
     """Of algorithms with constraints of their own: ``find_limits(args, constraint of the task)`` tells what the costs
     of a safe episode may reach, by constraint; None: the task's constraint is all there is."""
+
+    def learns(self, kind: str) -> bool:
+        """Whether it can learn tasks of a kind, of :data:`rl2grid.mdp.features.KINDS`."""
+        return kind == "H" or kind in self.kinds
+
+    def plays_continuous(self, kind: str) -> bool:
+        """Whether it learns tasks of a kind with continuous actions.
+
+        Joint tasks are learned as :class:`~rl2grid.envs.joint.JointAsDiscrete` by whom discrete actions are learned at
+        all, else as :class:`~rl2grid.envs.joint.JointAsBox`.
+        """
+        return kind == "R" or (kind == "H" and "T" not in self.kinds)
 
     def type_hints(self) -> dict[str, Any]:
         """Type hint of every hyperparameter."""
@@ -138,5 +151,5 @@ def find_algorithm(name: str) -> Algorithm:
 
 
 def algorithms_for(kind: str) -> tuple[str, ...]:
-    """Names of the algorithms that can learn tasks of a kind, ``"T"`` or ``"R"``."""
-    return tuple(name for name in algorithm_names() if kind in find_algorithm(name).kinds)
+    """Names of the algorithms that can learn tasks of a kind, of :data:`rl2grid.mdp.features.KINDS`."""
+    return tuple(name for name in algorithm_names() if find_algorithm(name).learns(kind))

@@ -107,7 +107,25 @@ class JointAsDiscrete(gymnasium.ActionWrapper[Any, Any, Any], gymnasium.utils.Re
         return str(base.describe_action(self.action(action)))
 
 
-class VectorJointAsBox(VectorActionWrapper):
+class _VectorJoint(VectorActionWrapper):
+    """What both vectors have in common: they are saved and brought back as what they wrap."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Where every environment is; see :meth:`rl2grid.envs.vector.PowerGridVectorEnv.state_dict`."""
+        state: dict[str, Any] = self.env.state_dict()  # type: ignore[attr-defined]
+        return state
+
+    def load_state_dict(self, state: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
+        """Bring every environment to where :meth:`state_dict` found it.
+
+        Raises:
+            UsageError: it is of other environments than these.
+        """
+        observations, infos = self.env.load_state_dict(state)  # type: ignore[attr-defined]
+        return observations, infos
+
+
+class VectorJointAsBox(_VectorJoint):
     """Many environments of a joint task with continuous actions, float32 [environment, n + m].
 
     Raises:
@@ -131,7 +149,7 @@ class VectorJointAsBox(VectorActionWrapper):
         return {TOPOLOGY: values[:, :n].argmax(axis=1), INJECTION: values[:, n:]}
 
 
-class VectorJointAsDiscrete(VectorActionWrapper):
+class VectorJointAsDiscrete(_VectorJoint):
     """Many environments of a joint task with discrete actions, integers [environment].
 
     Raises:

@@ -24,7 +24,7 @@ from rl2grid.scenarios.library import check_in_split, generator_version, scenari
 from rl2grid.scenarios.splits import TRAIN, VALIDATION, VALIDATION_MONTHS
 from rl2grid.training.tracking import check_tracking
 
-_ACTIONS = {"T": "discrete", "R": "continuous", "H": "joint"}
+_ACTIONS = {"T": "discrete", "R": "continuous"}
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def hyperparameters(algorithm: str, task: Task | str, preset: str = "default", *
     for name in changes:
         if name not in known:
             raise one_of(f"Hyperparameter of {algorithm}", name, known)
-    resolved: Hyperparameters = chosen.preset(preset, continuous=task.kind == "R", **changes)
+    resolved: Hyperparameters = chosen.preset(preset, continuous=chosen.plays_continuous(task.kind), **changes)
     return resolved
 
 
@@ -205,13 +205,8 @@ def read_config(folder: Path) -> tuple[RunArgs, dict[str, Any]]:
 
 def _checked_algorithm(name: str, task: Task) -> Algorithm:
     algorithm = find_algorithm(name)
-    if task.kind not in algorithm.kinds:
+    if not algorithm.learns(task.kind):
         able = algorithms_for(task.kind)
-        if not able:
-            raise UsageError(
-                f"No algorithm learns {task.id} from the command line, which has {_ACTIONS[task.kind]} actions: give "
-                "one a vector of environments in VectorJointAsBox or VectorJointAsDiscrete of rl2grid.envs.joint."
-            )
         raise UsageError(
             f"Algorithm {name!r} cannot learn {task.id}, which has {_ACTIONS[task.kind]} actions: "
             f"choose one of {', '.join(able)}."

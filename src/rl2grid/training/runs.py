@@ -23,7 +23,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import gymnasium
 
@@ -32,6 +32,7 @@ from rl2grid.algorithms.metrics import MetricsWriter
 from rl2grid.algorithms.policy_agent import BEST_FILE, CHECKPOINT_FILE, PolicyAgent
 from rl2grid.algorithms.registry import VectorEnvironment, find_algorithm
 from rl2grid.algorithms.trainer import Trainer
+from rl2grid.envs.joint import VectorJointAsBox, VectorJointAsDiscrete
 from rl2grid.envs.options import changed_options
 from rl2grid.envs.registration import register_all
 from rl2grid.errors import UsageError
@@ -61,9 +62,9 @@ UNLIMITED = TimeLimit(None)
 
 
 def make_envs(args: RunArgs) -> VectorEnvironment:
-    """The training environments of a run."""
+    """The training environments of a run; those of joint tasks flattened as the algorithm needs them."""
     register_all()
-    return gymnasium.make_vec(
+    envs: Any = gymnasium.make_vec(
         args.task.id,
         num_envs=args.hyperparameters.num_envs,
         num_threads=args.num_threads,
@@ -71,6 +72,10 @@ def make_envs(args: RunArgs) -> VectorEnvironment:
         gamma=args.hyperparameters.gamma,
         **changed_options(args.env_keywords),
     )
+    if args.task.kind != "H":
+        return cast("VectorEnvironment", envs)
+    continuous = find_algorithm(args.algorithm).plays_continuous("H")
+    return VectorJointAsBox(envs) if continuous else VectorJointAsDiscrete(envs)
 
 
 def train(
