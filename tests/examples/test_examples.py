@@ -11,9 +11,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import gymnasium
+import numpy as np
 import pytest
 
+import rl2grid  # noqa: F401  (registers the tasks)
 from rl2grid.cli.main import main
+from rl2grid.errors import UsageError
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 NEEDS = {
@@ -72,7 +76,7 @@ def test_is_short_and_says_how_to_install(path):
 
 
 def test_every_example_is_run():
-    ran = {*NEEDS, "graph_observations", "lowest_loading"}
+    ran = {*NEEDS, "graph_observations", "lowest_loading", "optim_cvxpy"}
     assert {path.stem for path in EXAMPLES.glob("*.py")} == ran
 
 
@@ -93,6 +97,38 @@ def test_an_agent_in_a_file_is_played(monkeypatch, capsys, tmp_path):
     (summary,) = json.loads(capsys.readouterr().out)["summaries"]
     assert summary["agent"] == "lowest-loading"
     assert summary["survival"]["value"] > 0.5
+
+
+def test_a_published_agent_plays_what_it_asks_grid2op_for(monkeypatch):
+    """With an agent in the place of the published one, which needs an environment of its own."""
+    spec = importlib.util.spec_from_file_location("optim_cvxpy", EXAMPLES / "optim_cvxpy.py")
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    asked = {"redispatch": [(0, 2.0), (1, -3.0)], "curtail": [(3, 0.4)]}
+
+    class Published:
+        def __init__(self, action_space, environment):
+            self._action_space = action_space
+
+        def reset(self, seen):
+            assert seen.current_step == 0
+
+        def act(self, seen, reward, done):
+            return self._action_space(asked)
+
+    agent = script.OptimCVXPY()
+    monkeypatch.setattr(script, "published_agent", lambda: Published)
+    with gymnasium.make("rl2grid/bus14-R-v0", engine="reference", split="bundled") as env:
+        agent.bind(env)
+        observation, info = env.reset(seed=0)
+        agent.reset(0)
+        env.step(agent.act(observation, info))
+        state = env.unwrapped.state
+        assert state.target_dispatch[0, :2].tolist() == pytest.approx([2.0, -3.0], abs=1e-5)
+        assert state.curtailment_limit[0, 3] == pytest.approx(0.4, abs=1e-6)
+        assert (np.delete(state.curtailment_limit[0], 3) == 1).all()
+    with gymnasium.make("rl2grid/bus14-R-v0") as env, pytest.raises(UsageError, match="add --engine reference"):
+        agent.bind(env)
 
 
 def test_graph_observations_without_pytorch_geometric(monkeypatch, capsys):
