@@ -18,7 +18,6 @@ from rl2grid.agents.topology_search import NOTHING, SAFE, TopologySearch
 from rl2grid.arrays import F32, F64
 from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.engines.native.what_if import WhatIf, forecast_of, snapshot_of
-from rl2grid.engines.worlds import Outlook
 from rl2grid.errors import UsageError, one_of
 from rl2grid.grids import Grid
 from rl2grid.mdp.actions import ActionKind, continuous_layout, full_catalogue
@@ -238,9 +237,10 @@ class Planner:
 
     def _series(self, state: GridState) -> Series:
         assert self._dispatch is not None
-        outlook = self._env.imagine(0).series
-        assert isinstance(outlook, Outlook)
-        return self._dispatch.foreseen(state, outlook.prod_p)
+        outlook = self._env.engine.outlook(0)
+        # An imagined world goes on from forecasts of an earlier step, the last of which repeats.
+        past = min(int(state.step[0]) + 1 - outlook.first_step, len(outlook.prod_p) - 1)
+        return self._dispatch.foreseen(state, outlook.prod_p[past:])
 
     def _injection(self, moment: _Moment, point: Snapshot, topology: int, series: Series) -> F32 | None:
         """The continuous action with a topology action, float32 [continuous]; None: none, or it cannot be followed."""

@@ -255,16 +255,25 @@ class NativeEngine:
         Raises:
             UsageError: there is no episode in progress.
         """
+        outlook = self.outlook(i)
+        rows = imagined_rows(self.grid, self._layout, self.environments.opponent, self.save(i).rows, seed)
+        return World(self.home, rows, outlook)
+
+    def outlook(self, i: int) -> Outlook:
+        """The forecasts of environment ``i``; in an imagined world those that it was imagined with.
+
+        Raises:
+            UsageError: there is no episode in progress.
+        """
         playing, state = self._series_of(i), self.state
         if state.terminated[i] or state.truncated[i]:
             raise UsageError("Nothing can be imagined after the end of an episode: reset the environment first.")
-        rows = imagined_rows(self.grid, self._layout, self.environments.opponent, self.save(i).rows, seed)
-        series = playing.name
-        if isinstance(series, SeriesName):
-            source, gen_v = playing.source, self.environments.hidden.gen_v[i]
-            assert not isinstance(source, Outlook)
-            series = outlook_of(source, series.start, int(state.step[i]), self._network, gen_v)
-        return World(self.home, rows, series)
+        name, source = playing.name, playing.source
+        if isinstance(source, Outlook):
+            return source
+        assert isinstance(name, SeriesName)
+        gen_v = self.environments.hidden.gen_v[i]
+        return outlook_of(source, name.start, int(state.step[i]), self._network, gen_v)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> NativeEngine:
         """An engine of its own, whose environments are where these are; grid and series are shared."""
