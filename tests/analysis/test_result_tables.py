@@ -67,6 +67,14 @@ def test_survival_has_the_shape_of_the_paper():
     assert not any(cell.best for cell in continuous.rows[0])  # equal as printed
 
 
+def test_joint_tasks_have_a_table_of_their_own():
+    joint = group_methods([result("greedy", [[0.7], [0.5]], task="rl2grid/bus14-H1-v0")])
+    table = next(table for table in result_tables({**METHODS, **joint}) if table.name == "survival-joint")
+    assert texts(table.rows[0])[:3] == ["bus14", "1", "0.60 ± 0.18"]
+    assert "joint actions" in table.caption
+    assert survival_table(METHODS, "T").name == "survival-topology"
+
+
 def test_the_least_gap_is_best():
     rows = {row[1].text: row for row in aggregate_table({TASK: METHODS[TASK]}).rows}
     assert rows["ppo + recovery"][-1].text.startswith("0.050 [")
