@@ -29,7 +29,7 @@ def analyse(folder: Path, *names: str) -> Sequence[str]:
 def test_tables_and_figures_are_written(folder, capsys, monkeypatch):
     monkeypatch.setattr("rl2grid.analysis.section.evaluation_pictures", lambda methods: [])
     assert main(analyse(folder, str(folder / "nothing"), f"dice={folder / 'random'}")) == 0
-    assert "6 tables and 0 figures" in capsys.readouterr().out
+    assert "7 tables and 0 figures" in capsys.readouterr().out
     table = (folder / "section" / "tables" / "survival-topology.md").read_text()
     assert "Baselines do-nothing" in table
     assert "Baselines dice" in table
@@ -42,7 +42,7 @@ def test_evaluations_below_a_folder_are_those_of_the_split(folder, capsys, monke
         (folder / "agent" / "evaluation").mkdir(parents=True, exist_ok=True)
         shutil.copytree(folder / "nothing", folder / "agent" / "evaluation" / name)
     assert main(analyse(folder, str(folder / "agent"))) == 0
-    assert "5 tables" in capsys.readouterr().out
+    assert "6 tables" in capsys.readouterr().out
     assert main([*analyse(folder, str(folder / "agent")), "--split", "train"]) == 2
 
 
