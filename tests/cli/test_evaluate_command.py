@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from typing import Any
 
@@ -10,6 +11,8 @@ from sample_results import result
 
 from rl2grid.cli import evaluate as command
 from rl2grid.cli.main import main
+from rl2grid.evaluation import l2rpn
+from rl2grid.records.l2rpn import L2RPNScores
 
 SURVIVALS = {"do-nothing": [[0.1], [0.3], [0.2]], "greedy": [[0.5], [0.8], [0.6]], "random": [[0.1], [0.2], [0.1]]}
 
@@ -68,3 +71,32 @@ def test_the_planner_searches_for_as_long_as_it_is_told(played, capsys):
     assert one["agent"].name == "planner (0.1 s)"
     assert one["command"].endswith("--months 1 --seconds 0.1")
     assert one["output"].name == "validation-1-months-0.1-seconds"
+
+
+def test_scores_of_l2rpn_stand_in_a_table_of_their_own(monkeypatch, capsys):
+    def scored(result, on_progress):
+        on_progress(len(result.episodes))
+        return tuple(L2RPNScores(80.0, 70.0, 100.0, 84.0) for _ in result.episodes)
+
+    monkeypatch.setattr(l2rpn, "l2rpn_scores", scored)
+    words = ["evaluate", "do-nothing", "greedy", "bus14-T0", "--months", "3", "--json", "--l2rpn"]
+    assert main(words) == 0
+    first, second = json.loads(capsys.readouterr().out)["l2rpn"]
+    assert (first["Method"], second["Method"]) == ("do-nothing", "greedy")
+    assert second["L2RPN 2020"]["value"] == 80
+    assert second["2023 without alerts"]["value"] == 84
+    assert second["Cost"] == "-"
+
+
+def test_a_length_is_asked_for_and_named(played, monkeypatch, capsys):
+    monkeypatch.setattr(command, "evaluate", lambda agent, task, **asked: with_length(agent, asked))
+    assert main(["evaluate", "greedy", "bus14-T0", "--episode-length", "2016"]) == 0
+    shown = capsys.readouterr().out
+    assert "bus14-T0-v0, validation scenarios, episodes of 2016 steps" in shown
+    assert "validation-episode-length-2016" in shown
+
+
+def with_length(agent: str, asked: dict[str, Any]):
+    assert "--episode-length 2016" in asked["command"]
+    made = result(agent, SURVIVALS[agent], split=asked["split"], episode_length=asked["episode_length"])
+    return replace(made, folder=asked["output"])
