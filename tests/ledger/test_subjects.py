@@ -95,3 +95,9 @@ def test_a_list_is_used_up(played, tmp_path: Path, capsys, monkeypatch):
 def test_what_is_no_finished_run_has_no_test(tmp_path: Path):
     with pytest.raises(UsageError, match="holds no run"):
         find_subject(str(tmp_path))
+
+
+def test_a_length_is_part_of_a_configuration_where_it_was_given():
+    """Configurations that were entered before there were lengths are called as they were."""
+    assert subjects._frozen({"heuristic": None, "episode_length": None}) == {"heuristic": None}
+    assert subjects._frozen({"episode_length": 2016}) == {"episode_length": 2016}

@@ -26,6 +26,7 @@ CASES: list[tuple[str, str, str, dict[str, Any], dict[str, Any]]] = [
     ("td3", "bus14-R", "default", {}, {"reward": (1.0, 0.5, 1e-3), "normalize": None, "opponent": False}),
     ("dqn", "bus36-M-T0", "default", {"mask_actions": False, "huber_delta": None}, {"reward": "paper"}),
     ("ppo", "bus14-T0", "paper", {"torch_threads": 2, "device": "auto"}, {"scenario": "a month/of its own"}),
+    ("ppo", "bus14-T0", "default", {}, {"episode_length": 2016}),
     ("lagrangian-ppo", "bus14-T0-TLO", "default", {"thresholds": (20.0,), "constraints": ("TLO",)}, {}),
 ]
 

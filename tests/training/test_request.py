@@ -24,6 +24,7 @@ def test_the_stored_request_is_the_request(tmp_path: Path):
     assert args.hyperparameters == SMALL
     assert args.env_keywords["reward"] == (1.0, 0.5, 0.25)
     assert args.env_keywords["split"] == "train"
+    assert args.env_keywords["episode_length"] is None
     assert args.task == find_task("rl2grid/bus14-T0-v0")
     assert args.folder == folder
     assert asdict(args)["checkpoint_seconds"] == 0.0
@@ -48,6 +49,7 @@ def test_limits_are_those_of_the_constraint_or_of_lagrangian_ppo(tmp_path: Path)
         ({"algorithm": "td4"}, "choose one of ppo"),
         ({"env_keywords": {"heuristics": "idle"}}, "Environment keyword 'heuristics' does not exist"),
         ({"env_keywords": {"heuristic": "lazy"}}, "lazy"),
+        ({"env_keywords": {"episode_length": 0}}, "episode_length=0 is not allowed: give a number of grid steps"),
         ({"env_keywords": {"gamma": 0.9}}, "gamma belongs to"),
         ({"env_keywords": {"split": "test"}}, "Training on the test scenarios"),
         ({"env_keywords": {"reward": lambda state, i: 0.0}}, "stores its reward by name"),
