@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rl2grid.agents.agent import Action, Considered, Info, Observation
-from rl2grid.agents.contingencies import NONE, danger, expected
+from rl2grid.agents.contingencies import NONE, Contingencies, danger, expected
 from rl2grid.agents.dispatch import controls, encode
 from rl2grid.agents.greedy_topology import effects
 from rl2grid.agents.secure_dispatch import SecureDispatch, Series
@@ -101,7 +101,7 @@ class Planner:
         base: Any = env.unwrapped
         if not isinstance(base.engine, NativeEngine):
             raise UsageError("Agent 'planner' asks what-ifs of the native engine: choose engine=\"native\".")
-        self._env, self._space = base, env.action_space
+        self._env = base
         self._grid: Grid = base.grid
         self._what_if = WhatIf(self._grid)
         self._search: TopologySearch | None = None
@@ -124,6 +124,7 @@ class Planner:
     def act(self, observation: Observation, info: Info) -> Action:
         """What it plans for the next step."""
         state: GridState = self._env.state
+        self._why = ""
         if self._dispatch is not None:
             self._dispatch.watch(state)
         moment = self._moment(state)
@@ -216,18 +217,19 @@ class Planner:
                 return self._action(NOTHING, injection)
         topology = NOTHING
         if moment.ahead:
-            wary = (
-                NONE
-                if "danger" in self._without or moment.state.attacked[0].any()
-                else expected(self._grid, moment.state)
-            )
-            found = self._search.best(moment.ahead, moment.state.timestep_overflow[0], wary)
+            found = self._search.best(moment.ahead, moment.state.timestep_overflow[0], self._feared(moment))
             topology = found.action
             self._why = (
                 f"{found.n_actions} actions lead to a worst loading of {found.worst_loading:.0%}"
                 f"{f', with {found.n_trips} lines tripped' if found.n_trips else ''}"
             )
         return self._action(topology, None if series is None else self._injection(moment, point, topology, series))
+
+    def _feared(self, moment: _Moment) -> Contingencies:
+        """The outages by which sequences are chosen: none while one attack is on."""
+        if "danger" in self._without or moment.state.attacked[0].any():
+            return NONE
+        return expected(self._grid, moment.state)
 
     def _can_close(self, moment: _Moment) -> bool:
         state = moment.state
