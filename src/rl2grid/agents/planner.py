@@ -208,8 +208,11 @@ class Planner:
         series = None if self._dispatch is None else self._series(moment.state)
         if self._search is None:
             assert series is not None
-            self._why = "dispatch against the overload"
-            return self._action(NOTHING, self._injection(moment, point, NOTHING, series))
+            injection = self._injection(moment, point, NOTHING, series)
+            if injection is not None and not self._worst(NOTHING, injection) < self._worst(NOTHING, None):
+                injection = None
+            self._why = "dispatch against the overload" if injection is not None else "no dispatch helps"
+            return self._action(NOTHING, injection)
         if series is not None and "dispatch first" not in self._without and not self._can_close(moment):
             injection = self._injection(moment, point, NOTHING, series)
             if injection is not None and self._worst(NOTHING, injection) < _ENOUGH:
@@ -281,7 +284,8 @@ class Planner:
                 return part
         return None
 
-    def _worst(self, topology: int, injection: F32) -> float:
+    def _worst(self, topology: int, injection: F32 | None) -> float:
+        """The worst loading by the forecast; infinite where the game would be lost."""
         result = self._env.simulate(self._action(topology, injection))
         rho: NDArray[Any] = result.observation[self._env.observation_slices["rho"]]
         return np.inf if result.terminated else float(rho.max())
