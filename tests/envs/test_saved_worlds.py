@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import pickle
+from dataclasses import replace
 from typing import Any
 
 import gymnasium
@@ -138,6 +139,16 @@ def test_worlds_go_from_row_to_row_and_between_vectors_and_single_environments(t
             alone = not (straight[2][1] or straight[3][1])
     vector.restore(0, worlds[2])
     assert vector.save(0) == worlds[2]
+
+
+def test_a_world_of_a_version_with_other_keywords_is_refused():
+    env = make("bus14-T0")
+    env.reset(seed=0)
+    world = env.save()
+    assert world.standing is not None
+    older = world.at(replace(world.standing, options=world.standing.options[:-1]))
+    with pytest.raises(UsageError, match="saved by another version of rl2grid"):
+        env.restore(older)
 
 
 def test_worlds_of_something_else_are_refused():

@@ -346,7 +346,14 @@ class TaskEnvironments:
             raise UsageError("This world is of an engine alone: restore one that an environment has saved.")
         if standing.task != self.task.id:
             raise UsageError(f"This world is of {standing.task}: it cannot be restored in {self.task.id}.")
-        for (name, theirs), (_, mine) in zip(standing.options, self._keywords, strict=True):
+        saved = dict(standing.options)
+        if set(saved) != {name for name, _ in self._keywords}:
+            raise UsageError(
+                f"This world was saved by another version of rl2grid, whose environments have the keywords "
+                f"{', '.join(saved)}: play the episode, or the training, again."
+            )
+        for name, mine in self._keywords:
+            theirs = saved[name]
             if theirs != mine:
                 raise UsageError(f"This world is of an environment with {name}={theirs}, this one has {name}={mine}.")
         return standing
