@@ -41,7 +41,21 @@ JointAction = dict[str, Any]
 """``topology``: int or int64 [n]; ``injection``: float32 [m] or [n, m]."""
 
 
-class JointAsBox(gymnasium.ActionWrapper[Any, Any, Any], gymnasium.utils.RecordConstructorArgs):
+class _Joint(gymnasium.ActionWrapper[Any, Any, Any], gymnasium.utils.RecordConstructorArgs):
+    """What both wrappers of one environment have in common."""
+
+    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
+        gymnasium.utils.RecordConstructorArgs.__init__(self)
+        gymnasium.ActionWrapper.__init__(self, env)
+        self._task = _joint_task(env, env.action_space)
+
+    def describe_action(self, action: Any) -> str:
+        """The action in words."""
+        base: Any = self.env.unwrapped
+        return str(base.describe_action(self.action(action)))
+
+
+class JointAsBox(_Joint):
     """A joint task with continuous actions; see the table of :mod:`rl2grid.envs.joint`.
 
     Raises:
@@ -49,9 +63,7 @@ class JointAsBox(gymnasium.ActionWrapper[Any, Any, Any], gymnasium.utils.RecordC
     """
 
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
-        gymnasium.utils.RecordConstructorArgs.__init__(self)
-        gymnasium.ActionWrapper.__init__(self, env)
-        self._task = _joint_task(env, env.action_space)
+        super().__init__(env)
         self.action_space = box_of(self._task)
 
     def action(self, action: Any) -> JointAction:
@@ -64,13 +76,8 @@ class JointAsBox(gymnasium.ActionWrapper[Any, Any, Any], gymnasium.utils.RecordC
         n = self._task.n_topology_actions
         return {TOPOLOGY: int(values[:n].argmax()), INJECTION: values[n:]}
 
-    def describe_action(self, action: Any) -> str:
-        """The action in words."""
-        base: Any = self.env.unwrapped
-        return str(base.describe_action(self.action(action)))
 
-
-class JointAsDiscrete(gymnasium.ActionWrapper[Any, Any, Any], gymnasium.utils.RecordConstructorArgs):
+class JointAsDiscrete(_Joint):
     """A joint task with discrete actions; see the table of :mod:`rl2grid.envs.joint`.
 
     Raises:
@@ -78,9 +85,7 @@ class JointAsDiscrete(gymnasium.ActionWrapper[Any, Any, Any], gymnasium.utils.Re
     """
 
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
-        gymnasium.utils.RecordConstructorArgs.__init__(self)
-        gymnasium.ActionWrapper.__init__(self, env)
-        self._task = _joint_task(env, env.action_space)
+        super().__init__(env)
         self._moves = control_moves(self._task.grid)
         self.action_space = discrete_of(self._task)
 
@@ -101,14 +106,13 @@ class JointAsDiscrete(gymnasium.ActionWrapper[Any, Any, Any], gymnasium.utils.Re
         base: Any = self.env.unwrapped
         return np.concatenate((base.action_masks(), np.ones(len(self._moves), np.bool_)))
 
-    def describe_action(self, action: Any) -> str:
-        """The action in words."""
-        base: Any = self.env.unwrapped
-        return str(base.describe_action(self.action(action)))
-
 
 class _VectorJoint(VectorActionWrapper):
     """What both vectors have in common: they are saved and brought back as what they wrap."""
+
+    def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
+        super().__init__(env)
+        self._task = _joint_task(env, env.single_action_space)
 
     def state_dict(self) -> dict[str, Any]:
         """Where every environment is; see :meth:`rl2grid.envs.vector.PowerGridVectorEnv.state_dict`."""
@@ -134,7 +138,6 @@ class VectorJointAsBox(_VectorJoint):
 
     def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
         super().__init__(env)
-        self._task = _joint_task(env, env.single_action_space)
         self.single_action_space = box_of(self._task)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 
@@ -158,7 +161,6 @@ class VectorJointAsDiscrete(_VectorJoint):
 
     def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
         super().__init__(env)
-        self._task = _joint_task(env, env.single_action_space)
         moves = control_moves(self._task.grid)
         self._injections = np.concatenate((np.zeros((1, self._task.n_injections), np.float32), moves))
         self.single_action_space = discrete_of(self._task)
