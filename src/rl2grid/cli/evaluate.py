@@ -16,7 +16,7 @@ from rl2grid.analysis.summary_table import summary_table
 from rl2grid.analysis.table import table_records
 from rl2grid.cli import keywords
 from rl2grid.cli.output import Output
-from rl2grid.cli.scoring import scored_table
+from rl2grid.cli.scoring import add_scores_flag, scored_table
 from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import make_agent
@@ -54,11 +54,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         "--seconds", type=float, default=None, help="that the planner may search per decision; by default unlimited"
     )
     parser.add_argument("--output", type=Path, default=None, help="folder of the results of one agent")
-    parser.add_argument(
-        "--l2rpn",
-        action="store_true",
-        help="also the scores of the L2RPN competitions, for which two baselines are played",
-    )
+    add_scores_flag(parser)
     parser.set_defaults(run=_run)
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rl2grid.cli.output import Output
-from rl2grid.cli.scoring import scored_table
+from rl2grid.cli.scoring import add_scores_flag, scored_table
 from rl2grid.envs.tasks import find_task
 from rl2grid.errors import UsageError
 from rl2grid.records.entries import PlayableEntry, read_entry, write_entry
@@ -74,11 +74,7 @@ def _add_table(actions: Any) -> None:
     parser.add_argument(
         "--to", default=None, metavar="NAME", help="of a ledger: what rows are compared with, as 'greedy + recovery'"
     )
-    parser.add_argument(
-        "--l2rpn",
-        action="store_true",
-        help="also the scores of the L2RPN competitions, for which two baselines are played",
-    )
+    add_scores_flag(parser)
     parser.set_defaults(run=_table)
 
 

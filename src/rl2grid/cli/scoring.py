@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Sequence
 
 from rl2grid.analysis.l2rpn_table import l2rpn_table
 from rl2grid.analysis.table import ResultTable
 from rl2grid.cli.output import Output
 from rl2grid.records.methods import Method
+
+
+def add_scores_flag(parser: argparse.ArgumentParser) -> None:
+    """Add the flag that asks for the scores."""
+    parser.add_argument(
+        "--l2rpn",
+        action="store_true",
+        help="also the scores of the L2RPN competitions, for which two baselines are played",
+    )
 
 
 def scored_table(methods: Sequence[Method], output: Output) -> ResultTable:
