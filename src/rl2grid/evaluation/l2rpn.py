@@ -32,6 +32,7 @@ from rl2grid.records.evaluations import Evaluation, identity_hash
 from rl2grid.records.files import make_folder, read_json, write_json
 from rl2grid.records.l2rpn import Baselines, L2RPNScores, Operation, scores_of, write_scores
 from rl2grid.records.l2rpn import operation_of as operation_in
+from rl2grid.records.locks import locked
 from rl2grid.scenarios.cache import data_folder
 from rl2grid.scenarios.episodes import EpisodePlan, plan_episode
 from rl2grid.scenarios.library import load_scenario
@@ -101,7 +102,9 @@ class _Memory:
     def write(self) -> None:
         """Add what is known to the file; what others have added meanwhile stays."""
         make_folder(self._path.parent)
-        write_json(self._path, {key: asdict(row) for key, row in {**self._read(), **self.rows}.items()}, indent=None)
+        with locked(self._path.parent, wait=True):
+            known = {**self._read(), **self.rows}
+            write_json(self._path, {key: asdict(row) for key, row in known.items()}, indent=None)
 
     def _read(self) -> dict[str, Baselines]:
         if not self._path.is_file():
