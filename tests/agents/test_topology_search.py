@@ -34,7 +34,7 @@ def test_one_action_alone_is_the_best_by_its_score(seed):
     env = overloaded(seed=seed)
     search, point = search_of(env, longest=0), forecast_of(env.engine, 0)
     assert point is not None
-    found = search.best([point], none(env), NONE)
+    found = search.best(point, none(env), NONE)
     outcomes, rho = search.outcomes(point)
     score = np.where(outcomes.legal, outcomes.worst_loading, np.inf) + 0.3 * np.clip(rho - 1.0, 0.0, 2.0).sum(axis=1)
     score = score + 3.0 * (rho > env.grid.rules.hard_overflow).any(axis=1)
@@ -60,7 +60,7 @@ def test_a_sequence_is_found_where_no_action_alone_helps():
         )
         if single < 0.95 or pairs >= 0.95:
             continue
-        found = search.best([heavy], none(env), NONE)
+        found = search.best(heavy, none(env), NONE)
         assert found.n_actions == 2
         assert found.worst_loading < 0.95
         assert found.n_trips == 0
@@ -93,9 +93,9 @@ def test_a_line_that_is_about_to_trip_leaves_no_time_for_sequences():
     allowed = env.grid.rules.overflow_allowed
     heavy = point._replace(load_p=(point.load_p * 1.5).astype(np.float32), gen_p=(point.gen_p * 1.5).astype(np.float32))
     overflow = np.full(env.grid.n_line, allowed, np.int32)
-    late = search.best([heavy], overflow, NONE)
+    late = search.best(heavy, overflow, NONE)
     assert late.n_trips > 0 or not np.isfinite(late.worst_loading)
-    early = search.best([heavy], none(env), NONE)
+    early = search.best(heavy, none(env), NONE)
     assert early.n_trips <= late.n_trips
 
 
@@ -109,7 +109,7 @@ def test_of_those_that_make_the_grid_safe_the_least_endangered_is_chosen():
         pytest.skip("nothing to choose between")
     lines = np.array(sorted(env.grid.opponent.areas[0]), np.int32)
     contingencies = Contingencies(lines, np.ones(len(lines)))
-    found = search.best([point], none(env), contingencies)
+    found = search.best(point, none(env), contingencies)
     what_if = WhatIf(env.grid)
     chosen = danger(what_if, search.after(point, found.action), contingencies)
     first = danger(what_if, search.after(point, int(safe[outcomes.worst_loading[safe].argmin()])), contingencies)
@@ -120,7 +120,7 @@ def test_large_catalogues_are_searched_in_full_first_and_in_part_later():
     env = overloaded("bus36-M-T2")
     search, point = search_of(env), forecast_of(env.engine, 0)
     assert point is not None
-    found = search.best([point], none(env), NONE)
+    found = search.best(point, none(env), NONE)
     assert 0 <= found.action < len(env.action_catalogue_ids)
 
 
@@ -129,7 +129,7 @@ def test_a_time_limit_ends_the_search_after_what_it_has():
     point = forecast_of(env.engine, 0)
     assert point is not None
     heavy = point._replace(load_p=(point.load_p * 1.5).astype(np.float32), gen_p=(point.gen_p * 1.5).astype(np.float32))
-    found = search_of(env, seconds=1e-9).best([heavy], none(env), NONE)
+    found = search_of(env, seconds=1e-9).best(heavy, none(env), NONE)
     assert found.n_actions == 1
 
 

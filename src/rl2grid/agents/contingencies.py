@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rl2grid.arrays import F64, I32
-from rl2grid.engines.native.what_if import WhatIf
+from rl2grid.engines.native.what_if import OutageOutcomes, WhatIf
 from rl2grid.grids import Grid
 from rl2grid.mdp.state import GridState
 from rl2grid.powerflow.batch import Snapshot
@@ -53,8 +53,13 @@ def danger(what_if: WhatIf, point: Snapshot, contingencies: Contingencies) -> fl
     if len(contingencies.lines) == 0:
         return 0.0
     outcomes = what_if.outages(point, contingencies.lines)
-    excess = np.clip(outcomes.worst_loading.astype(np.float64) - 1.0, 0.0, 1.0)
-    return float((excess * contingencies.weight)[~outcomes.was_open].sum())
+    return float((overload_after(outcomes) * contingencies.weight)[~outcomes.was_open].sum())
+
+
+def overload_after(outcomes: OutageOutcomes) -> F64:
+    """The overload that each outage leaves, of its worst line: at most 1, and 1 for a collapse; float64 [outage]."""
+    overload: F64 = np.clip(outcomes.worst_loading.astype(np.float64) - 1.0, 0.0, 1.0)
+    return overload
 
 
 def _attack_weights(grid: Grid, state: GridState, lines: np.ndarray[tuple[int], np.dtype[np.int64]]) -> F64:

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from rl2grid.arrays import F64, I32
+from rl2grid.arrays import F32, F64, I32
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
 from rl2grid.mdp.state import GridState
@@ -48,11 +48,7 @@ def dc_point(state: GridState, i: int, grid: Grid, network: Network) -> DcPoint:
     ``sqrt(S_limit**2 - Q**2)``, but at least half of it, and at least the ``|P| / rho`` of now (voltages above nominal
     carry more).
     """
-    injection = np.zeros(grid.dim_topo)
-    injection[grid.gen_pos_topo_vect] = state.gen_p[i]
-    injection[grid.load_pos_topo_vect] = -state.load_p[i]
-    injection[grid.storage_pos_topo_vect] = -state.storage_power[i]
-    injection[grid.gen_pos_topo_vect[grid.slack_gen]] -= injection.sum()
+    injection = injections(grid, state.gen_p[i], state.load_p[i], state.storage_power[i])
     flow = state.p_or[i].astype(np.float64)
     per_ampere = np.sqrt(3.0) * network.nominal_voltage[network.line_or_sub] / 1000.0
     apparent, most = per_ampere * state.a_or[i], per_ampere * state.thermal_limit
@@ -61,6 +57,19 @@ def dc_point(state: GridState, i: int, grid: Grid, network: Network) -> DcPoint:
     limit = np.maximum(limit, np.abs(flow) / np.maximum(state.rho[i], _LEAST_LOADING))
     susceptance = network.line_susceptance * network.base_power[0]
     return DcPoint(state.topo_vect[i].copy(), injection, flow, limit, susceptance)
+
+
+def injections(grid: Grid, gen_p: F32, load_p: F32, storage_p: F32) -> F64:
+    """MW into the grid by element, float64 [topo]: productions, minus loads and storage, that sum to zero.
+
+    The generator that balances the flow makes up for the rest.
+    """
+    injection = np.zeros(grid.dim_topo)
+    injection[grid.gen_pos_topo_vect] = gen_p
+    injection[grid.load_pos_topo_vect] = -load_p
+    injection[grid.storage_pos_topo_vect] = -storage_p
+    injection[grid.gen_pos_topo_vect[grid.slack_gen]] -= injection.sum()
+    return injection
 
 
 def buses(grid: Grid, busbar: I32) -> I32:
@@ -130,7 +139,11 @@ def outage_factors(grid: Grid, table: F64, bus: I32, line: int) -> F64 | None:
 
 def dc_flow(grid: Grid, point: DcPoint) -> F64:
     """MW on each line, float64 [line]; 0 on open ones. The grid must be connected."""
+    return flow_by(sensitivities(grid, point), grid, point)
+
+
+def flow_by(table: F64, grid: Grid, point: DcPoint) -> F64:
+    """:func:`dc_flow` where the :func:`sensitivities` of the topology are known."""
     bus, on = buses(grid, point.busbar), point.busbar > 0
-    into = np.bincount(bus[on], point.injection[on], 2 * grid.n_sub)
-    flow: F64 = sensitivities(grid, point) @ into
+    flow: F64 = table @ np.bincount(bus[on], point.injection[on], 2 * grid.n_sub)
     return flow

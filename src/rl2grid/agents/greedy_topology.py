@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rl2grid.agents.agent import Action, Considered, Info, Observation, has_topology_actions, topology_action
+from rl2grid.agents.contingencies import overload_after
 from rl2grid.agents.recovery import Recovery
 from rl2grid.arrays import F64, Flags
 from rl2grid.errors import UsageError
@@ -134,8 +135,7 @@ def insecurity(outcomes: Any) -> float:
     Args:
         outcomes: what :meth:`PowerGridEnv.security` returns.
     """
-    lost = ~outcomes.was_open
-    return float(np.clip(outcomes.worst_loading[lost].astype(np.float64) - 1.0, 0.0, 1.0).sum())
+    return float(overload_after(outcomes)[~outcomes.was_open].sum())
 
 
 class Effect(NamedTuple):

@@ -9,9 +9,9 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from rl2grid.agents.agent import Action, Considered, Info, Observation
+from rl2grid.agents.agent import Action, Considered, Info, Observation, injecting_action
 from rl2grid.agents.contingencies import NONE, Contingencies, danger, expected
-from rl2grid.agents.dispatch import controls, encode
+from rl2grid.agents.dispatch import controls, encode, worst_loading
 from rl2grid.agents.greedy_topology import effects
 from rl2grid.agents.secure_dispatch import SecureDispatch, Series
 from rl2grid.agents.topology_search import NOTHING, SAFE, TopologySearch
@@ -57,7 +57,7 @@ class _Moment(NamedTuple):
 
     state: GridState
     safe: bool
-    ahead: list[Snapshot]  # forecasts of the next steps before anybody acts; none: the generators cannot follow
+    ahead: Snapshot | None  # forecast of the next step before anybody acts; None: the generators cannot follow
 
 
 class Planner:
@@ -101,16 +101,16 @@ class Planner:
         base: Any = env.unwrapped
         if not isinstance(base.engine, NativeEngine):
             raise UsageError("Agent 'planner' asks what-ifs of the native engine: choose engine=\"native\".")
-        self._env = base
+        self._env, self._space = base, env.action_space
         self._grid: Grid = base.grid
         self._what_if = WhatIf(self._grid)
         self._search: TopologySearch | None = None
-        if base.task.kind != "R":
+        if base.task.changes_topology:
             self._catalogue = full_catalogue(self._grid).take(base.action_catalogue_ids)
             longest = {"longest": 0} if "sequences" in self._without else {}
             self._search = TopologySearch(self._grid, self._catalogue, self._what_if, seconds=self._seconds, **longest)
         self._dispatch: SecureDispatch | None = None
-        if base.task.kind != "T":
+        if base.task.injects:
             self._dispatch = SecureDispatch(self._grid, load_network(self._grid), self._what_if)
 
     def reset(self, i: int) -> None:
@@ -139,24 +139,22 @@ class Planner:
         return Considered("", (), (), self._why) if self._why else None
 
     def _moment(self, state: GridState) -> _Moment:
-        engine = self._env.engine
-        point = forecast_of(engine, 0)
-        return _Moment(state, is_safe(state, 0), [] if point is None else [point])
+        return _Moment(state, is_safe(state, 0), forecast_of(self._env.engine, 0))
 
     def _is_calm(self, moment: _Moment) -> bool:
         """Whether nothing has to be done by the forecast."""
-        if not moment.ahead or self._search is None:
+        if moment.ahead is None or self._search is None:
             return True
-        outcomes, _ = self._search.outcomes(moment.ahead[0], np.zeros(1, np.int32))
+        outcomes, _ = self._search.outcomes(moment.ahead, np.zeros(1, np.int32))
         return bool(outcomes.worst_loading[NOTHING] < SAFE)
 
     def _restoring(self, moment: _Moment) -> int:
         """The entry that closes a line or brings a substation back, if that keeps the grid safe; else nothing."""
-        if self._search is None or not moment.ahead or is_at_reference(moment.state):
+        if self._search is None or moment.ahead is None or is_at_reference(moment.state):
             return NOTHING
         effect = effects(self._grid, moment.state, self._catalogue)
         closes = effect.restores & (self._catalogue.kind == ActionKind.SWITCH)
-        point = moment.ahead[0]
+        point = moment.ahead
         line = self._best_of(point, np.flatnonzero(closes), SAFE)
         if line:
             self._why = "while the grid is safe, a line is closed if that keeps it so"
@@ -204,7 +202,7 @@ class Planner:
 
     def _relieve(self, moment: _Moment) -> Action:
         """What makes the grid safe again."""
-        point = moment.ahead[0] if moment.ahead else snapshot_of(self._env.engine, 0)
+        point = moment.ahead if moment.ahead is not None else snapshot_of(self._env.engine, 0)
         series = None if self._dispatch is None else self._series(moment.state)
         if self._search is None:
             assert series is not None
@@ -219,7 +217,7 @@ class Planner:
                 self._why = "dispatch alone makes the grid safe"
                 return self._action(NOTHING, injection)
         topology = NOTHING
-        if moment.ahead:
+        if moment.ahead is not None:
             found = self._search.best(moment.ahead, moment.state.timestep_overflow[0], self._feared(moment))
             topology = found.action
             self._why = (
@@ -286,9 +284,7 @@ class Planner:
 
     def _worst(self, topology: int, injection: F32 | None) -> float:
         """The worst loading by the forecast; infinite where the game would be lost."""
-        result = self._env.simulate(self._action(topology, injection))
-        rho: NDArray[Any] = result.observation[self._env.observation_slices["rho"]]
-        return np.inf if result.terminated else float(rho.max())
+        return worst_loading(self._env, self._action(topology, injection))
 
     def _held(self) -> F32:
         """The injection that leaves dispatch and curtailment as they are."""
@@ -298,13 +294,10 @@ class Planner:
         values[n_gen : n_gen + len(layout.curtail)] = np.minimum(limits - 1.0, 0.0)
         return values
 
-    def _action(self, topology: int, injection: F64 | F32 | None) -> Action:
+    def _action(self, topology: int, injection: F32 | None) -> Action:
         if self._dispatch is None:
             return topology
-        values = self._held() if injection is None else injection
-        if self._search is None:
-            return values
-        return {"topology": topology, "injection": values}
+        return injecting_action(self._space, self._held() if injection is None else injection, topology)
 
 
 def is_at_reference(state: GridState) -> bool:

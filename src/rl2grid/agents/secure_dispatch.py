@@ -11,7 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rl2grid.agents.contingencies import Contingencies
-from rl2grid.agents.dc_flow import DcPoint, buses, dc_point, is_connected, outage_factors, sensitivities
+from rl2grid.agents.dc_flow import (
+    DcPoint,
+    buses,
+    dc_point,
+    flow_by,
+    injections,
+    is_connected,
+    outage_factors,
+    sensitivities,
+)
 from rl2grid.agents.dispatch import Control, control_positions, controls
 from rl2grid.agents.dispatch_programme import DispatchProgramme
 from rl2grid.arrays import F32, F64, I32
@@ -53,6 +62,7 @@ _KEPT, _KEPT_PER_STEP = 20.0, 2.0
 _DRIFT = 0.1
 """MW outside its room from which on a dispatch has drifted."""
 _LEAST_DRIFT_KEPT = 15.0
+"""MW that must be left for later steps; the plan asks for more, so that it is not made anew at once."""
 _TABLES = 8
 """Topologies of which sensitivities are kept."""
 _TRIFLE = 0.5
@@ -238,13 +248,10 @@ class SecureDispatch:
         outcome = self._what_if.actions(point, _NO_ACTION, None, rho)
         if outcome.verdict[0] != 0 or not is_connected(self._grid, point.topo_vect):
             return [], False
-        dc = dc_point(state, 0, self._grid, self._network)._replace(
-            busbar=point.topo_vect, injection=self._injections(point)
-        )
+        injection = injections(self._grid, point.gen_p, point.load_p, point.storage_p)
+        dc = dc_point(state, 0, self._grid, self._network)._replace(busbar=point.topo_vect, injection=injection)
         table = self._sensitivities(dc)
-        bus = buses(self._grid, dc.busbar)
-        on = dc.busbar > 0
-        flow = table @ np.bincount(bus[on], dc.injection[on], 2 * self._grid.n_sub)
+        bus, flow = buses(self._grid, dc.busbar), flow_by(table, self._grid, dc)
         effect = table[:, bus[self._positions]]
         cases = [_case(_NORMAL_WEIGHT, NORMAL_BOUND, flow, effect, rho[0], dc)]
         after = self._outages(dc, bus, table, flow, effect, point, contingencies)
@@ -259,16 +266,6 @@ class SecureDispatch:
                 del self._tables[next(iter(self._tables))]
             self._tables[key] = sensitivities(self._grid, dc)
         return self._tables[key]
-
-    def _injections(self, point: Snapshot) -> F64:
-        """MW into the grid by element of ``topo_vect``, as :class:`DcPoint` has them, balanced at the slack."""
-        grid = self._grid
-        injection = np.zeros(grid.dim_topo)
-        injection[grid.gen_pos_topo_vect] = point.gen_p
-        injection[grid.load_pos_topo_vect] = -point.load_p
-        injection[grid.storage_pos_topo_vect] = -point.storage_p
-        injection[grid.gen_pos_topo_vect[grid.slack_gen]] -= injection.sum()
-        return injection
 
     def _outages(
         self,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +10,7 @@ import numpy as np
 from rl2grid.agents.contingencies import Contingencies, danger
 from rl2grid.arrays import F32, F64, I32, Flags
 from rl2grid.engines.native.what_if import ActionOutcomes, WhatIf
-from rl2grid.envs.outages_after_action import busbars_after
+from rl2grid.envs.outages_after_action import point_after
 from rl2grid.grids import Grid
 from rl2grid.mdp.actions import ActionCatalogue, ActionKind, StepAction
 from rl2grid.powerflow.batch import Snapshot
@@ -74,6 +73,11 @@ class _Step(NamedTuple):
     overflow: I32
     rho: F32
 
+    @property
+    def first(self) -> int:
+        """Entry of the catalogue that the sequence begins with."""
+        return self.way.first if self.way.first >= 0 else self.action
+
 
 _LOST = Found(NOTHING, np.inf, 0, 0)
 
@@ -102,16 +106,16 @@ class TopologySearch:
         self._longest, self._seconds = longest, seconds
         self._actions: dict[int, StepAction] = {}
 
-    def best(self, points: Sequence[Snapshot], overflow: I32, contingencies: Contingencies) -> Found:
+    def best(self, point: Snapshot, overflow: I32, contingencies: Contingencies) -> Found:
         """The first action of the best sequence.
 
         Args:
-            points: forecasts for the next step and those after it, before anybody acts; the last one goes on.
+            point: forecast for the next step before anybody acts; its injections go on.
             overflow: steps that every line has been above its limit, int32 [line].
             contingencies: outages to be ready for, once the grid is safe.
         """
         until = np.inf if self._seconds is None else time.perf_counter() + self._seconds
-        ways = [_Way(-1, points[0], overflow.astype(np.int32), 0, np.inf, 0.0)]
+        ways = [_Way(-1, point, overflow.astype(np.int32), 0, np.inf, 0.0)]
         entries: I32 | None = None
         best = _LOST
         for depth in range(self._depth(overflow)):
@@ -123,8 +127,7 @@ class TopologySearch:
                 return self._safest(safe, depth + 1, contingencies)
             if entries is None and len(self._catalogue) > _WIDE:
                 entries = np.array(sorted({NOTHING, *(step.action for step in steps[:_WIDE])}), np.int32)
-            point = points[min(depth + 1, len(points) - 1)]
-            ways = self._ways(steps, _BEAM[min(depth, len(_BEAM) - 1)], point)
+            ways = self._ways(steps, _BEAM[min(depth, len(_BEAM) - 1)])
             if not ways:
                 break
             best = Found(ways[0].first, ways[0].worst, depth + 1, ways[0].n_trips)
@@ -134,11 +137,7 @@ class TopologySearch:
 
     def after(self, point: Snapshot, action: int) -> Snapshot:
         """The operating point after an action."""
-        played = self._action(action)
-        topology = busbars_after(self._grid, point.topo_vect, point.last_bus, played)
-        return point._replace(
-            topo_vect=topology, last_bus=np.where(topology > 0, topology, point.last_bus).astype(np.int32)
-        )
+        return point_after(self._grid, point, self._action(action))
 
     def outcomes(self, point: Snapshot, entries: I32 | None = None) -> tuple[ActionOutcomes, F32]:
         """What every action would do, and the loadings after it, float32 [action, line]."""
@@ -191,19 +190,18 @@ class TopologySearch:
         trips: Flags = (overflow > rules.overflow_allowed) | (rho > rules.hard_overflow)
         return trips
 
-    def _ways(self, steps: list[_Step], beam: int, point: Snapshot) -> list[_Way]:
+    def _ways(self, steps: list[_Step], beam: int) -> list[_Way]:
         """Where the best steps lead, the best first; of those that trip lines, those that leave a grid."""
         unhurt = any(not step.trips for step in steps[:beam])
         ways = []
         for step in steps[: beam if unhurt else max(beam, _BEAM[0])]:
-            way = self._followed(step, point)
+            way = self._followed(step)
             if way is not None:
                 ways.append(way)
         return sorted(ways, key=lambda way: way.score)[:beam]
 
-    def _followed(self, step: _Step, point: Snapshot) -> _Way | None:
+    def _followed(self, step: _Step) -> _Way | None:
         """The way that a step leads on, a step later; None where the cascade leaves no grid."""
-        first = step.way.first if step.way.first >= 0 else step.action
         after = self._cooled(self.after(step.way.point, step.action), step.action)
         rho, overflow, n_trips = step.rho, step.overflow, 0
         for _ in range(_CASCADE_ROUNDS):
@@ -220,9 +218,8 @@ class TopologySearch:
             overflow[tripped] = 0
         worst, n_trips = float(rho.max()), step.way.n_trips + n_trips
         overloads = float(np.clip(rho - 1.0, 0.0, _LARGEST_OVERLOAD).sum())
-        topology = {name: getattr(after, name) for name in ("topo_vect", "last_bus", "cooldown_line", "cooldown_sub")}
         score = worst + _OVERLOADS * overloads + _TRIPPED * n_trips
-        return _Way(first, point._replace(**topology), overflow, n_trips, worst, score)
+        return _Way(step.first, after, overflow, n_trips, worst, score)
 
     def _cooled(self, point: Snapshot, action: int) -> Snapshot:
         """A step later: cooldowns have run on, and what was changed cools down."""
@@ -243,10 +240,6 @@ class TopologySearch:
 
     def _safest(self, safe: list[_Step], n_actions: int, contingencies: Contingencies) -> Found:
         """Of the sequences that make the grid safe, the one that outages endanger least."""
-
-        def first(step: _Step) -> int:
-            return step.way.first if step.way.first >= 0 else step.action
-
         best = safe[0]
         if len(contingencies.lines) and len(safe) > 1:
             candidates = safe[:_CANDIDATES]
@@ -256,7 +249,7 @@ class TopologySearch:
                     _DANGER * danger(self._what_if, self.after(step.way.point, step.action), contingencies) + step.worst
                 ),
             )
-        return Found(first(best), best.worst, n_actions, 0)
+        return Found(best.first, best.worst, n_actions, 0)
 
     def _action(self, entry: int) -> StepAction:
         if entry not in self._actions:

@@ -10,6 +10,7 @@ from rl2grid.engines.native.what_if import OutageOutcomes, WhatIf, forecast_of
 from rl2grid.grids import Grid
 from rl2grid.mdp.actions import ActionKind, StepAction, moved_elements
 from rl2grid.mdp.termination import GameOver
+from rl2grid.powerflow.batch import Snapshot
 
 
 def outages_after(engine: NativeEngine, i: int, action: StepAction, solver: WhatIf) -> OutageOutcomes:
@@ -20,9 +21,14 @@ def outages_after(engine: NativeEngine, i: int, action: StepAction, solver: What
     snapshot = forecast_of(engine, i)
     if snapshot is None:
         return _all_lost(engine.grid.n_line)
-    topology = busbars_after(engine.grid, snapshot.topo_vect, snapshot.last_bus, action)
-    last_bus = np.where(topology > 0, topology, snapshot.last_bus).astype(np.int32)
-    return solver.outages(snapshot._replace(topo_vect=topology, last_bus=last_bus))
+    return solver.outages(point_after(engine.grid, snapshot, action))
+
+
+def point_after(grid: Grid, point: Snapshot, action: StepAction) -> Snapshot:
+    """An operating point after an action of changes of kind MOVE and SWITCH; injections and cooldowns stay."""
+    topology = busbars_after(grid, point.topo_vect, point.last_bus, action)
+    last_bus = np.where(topology > 0, topology, point.last_bus).astype(np.int32)
+    return point._replace(topo_vect=topology, last_bus=last_bus)
 
 
 def busbars_after(grid: Grid, busbar: I32, last_busbar: I32, action: StepAction) -> I32:
