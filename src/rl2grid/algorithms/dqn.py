@@ -92,6 +92,8 @@ class Args(OffPolicyArgs):
             self._check_shares("exploration_do_nothing")
         if self.huber_delta is not None:
             self._check_positive("huber_delta")
+        if self.head == DUELING and self.shortlist is not None:
+            raise UsageError("DQN's dueling head has no shortlist: choose head 'single', or leave the shortlist out.")
         if self.head not in HEADS:
             raise one_of("DQN's head", self.head, HEADS)
 

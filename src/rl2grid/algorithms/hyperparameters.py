@@ -55,7 +55,10 @@ class SharedArgs:
     normalize_observations: bool = True
     """Whether observations are scaled by running statistics shared by all environments."""
     network: str = added_later("mlp")
-    """Name of the kind of networks: ``mlp``, layers one after the other, or one of your own."""
+    """Name of the kind of networks: ``mlp``, layers one after the other, ``action-embedding``, ``gnn``, or one of your
+    own."""
+    shortlist: int | None = added_later(None)
+    """Discrete actions only: among how many it chooses, do nothing and the best-ranked ones; None: all."""
     torch_threads: int = 1
     """Threads of PyTorch; results are reproducible bit by bit for a given number only."""
     device: str = "cpu"

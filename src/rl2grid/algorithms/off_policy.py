@@ -260,7 +260,7 @@ class OffPolicyTrainer(Trainer):
         """One decision in every environment, remembered."""
         args, observations = self.args, self.observations
         assert observations is not None
-        masks = self.envs.action_masks() if args.mask_actions else None  # type: ignore[attr-defined]
+        masks = self.masks()
         with torch.no_grad():
             shown = self.normalized(observations)
             actions = self.explore(shown, None if masks is None else torch.as_tensor(masks)).cpu()

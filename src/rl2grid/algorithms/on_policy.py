@@ -437,7 +437,8 @@ class OnPolicyTrainer(Trainer):
         """One decision in every environment."""
         assert self.observations is not None
         observations = self.normalized(self.observations)
-        masks = self.tensor(self.envs.action_masks()) if self.args.mask_actions else None  # type: ignore[attr-defined]
+        legal = self.masks()
+        masks = None if legal is None else self.tensor(legal)
         with torch.no_grad():
             actions, log_probabilities = self.network.sample(observations, masks, self.generator)
         played = self.step(self._playable(actions), tally)

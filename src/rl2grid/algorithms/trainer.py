@@ -99,7 +99,8 @@ class Trainer(ABC):
                 f"Network {args.network!r} reads observations as the environment gives them: set "
                 "normalize_observations to False."
             )
-        self.networks = NetworkFactory(self.spec, args.network, self.generator)
+        self.networks = NetworkFactory(self.spec, args.network, self.generator, args.shortlist)
+        self._shortlisted = self._on_shortlist()
         self.normalizer = ObservationNormalizer(self.observation_size) if args.normalize_observations else None
         self._scale_of = -1
         self.reward_scale = 1.0 - args.gamma if args.reward_scale is None else args.reward_scale
@@ -115,6 +116,31 @@ class Trainer(ABC):
         self._over = np.zeros(args.num_envs, np.bool_)
         self._episode_return = np.zeros(args.num_envs, np.float64)
         self._episode_length = np.zeros(args.num_envs, np.int64)
+
+    def _on_shortlist(self) -> NDArray[np.bool_] | None:
+        """Which actions are on the shortlist, bool [action]; None: there is none.
+
+        Raises:
+            UsageError: illegal actions are not excluded, so that others could not be either.
+        """
+        chosen = self.networks.shortlisted()
+        if chosen is None:
+            return None
+        if not self.args.mask_actions:
+            raise UsageError("A shortlist excludes all other actions: set mask_actions to True, or leave it out.")
+        on_it = np.zeros(self.action_size, np.bool_)
+        on_it[chosen] = True
+        return on_it
+
+    def masks(self) -> NDArray[np.bool_] | None:
+        """The actions that may be chosen now, bool [num_envs, action]; None: all.
+
+        They are legal, and on the shortlist where there is one.
+        """
+        if not self.args.mask_actions:
+            return None
+        masks: NDArray[np.bool_] = self.envs.action_masks()  # type: ignore[attr-defined]
+        return masks if self._shortlisted is None else masks & self._shortlisted
 
     @property
     def finished(self) -> bool:

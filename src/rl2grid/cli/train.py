@@ -120,7 +120,9 @@ def _begin(algorithm: str, task_id: str, flags: list[str]) -> int:
         from rl2grid.training.validation import find_validator
     except ImportError as error:
         raise UsageError(f"Training needs {error.name}: install it with `pip install rl2grid[train]`.") from None
-    hyperparameters = request.hyperparameters(algorithm, task, _preset(flags))
+    network = _value(flags, "--network")
+    chosen = {} if network is None else {"network": network}
+    hyperparameters = request.hyperparameters(algorithm, task, _value(flags, "--preset") or "default", **chosen)
     _refuse_unknown(flags, [*fields(TrainFlags), *options_without(*GIVEN_OTHERWISE), *fields(hyperparameters)])
     own, keywords, hyperparameters = _parse_all(f"rl2grid train {algorithm} {task.id}", flags, hyperparameters)
     limit, output = TimeLimit(own.max_minutes), Output(json=own.json, quiet=own.quiet)
@@ -177,13 +179,14 @@ def _is_given(name: str, flags: list[str]) -> bool:
     return any(flag.split("=", 1)[0].replace("_", "-") == f"--{flag_of(name)}" for flag in flags)
 
 
-def _preset(flags: list[str]) -> str:
+def _value(flags: list[str], name: str) -> str | None:
+    """What the flag ``name`` says; None: it is not there."""
     for flag, value in zip(flags, [*flags, ""][1:], strict=True):
-        if flag == "--preset":
+        if flag == name:
             return value
-        if flag.startswith("--preset="):
-            return flag.removeprefix("--preset=")
-    return "default"
+        if flag.startswith(f"{name}="):
+            return flag.removeprefix(f"{name}=")
+    return None
 
 
 def _parse_all(

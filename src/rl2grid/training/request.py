@@ -74,8 +74,17 @@ def hyperparameters(algorithm: str, task: Task | str, preset: str = "default", *
     for name in changes:
         if name not in known:
             raise one_of(f"Hyperparameter of {algorithm}", name, known)
+    if "network" in changes and not _reads_normalized(changes["network"]):
+        changes = {"normalize_observations": False} | changes
     resolved: Hyperparameters = chosen.preset(preset, continuous=chosen.plays_continuous(task.kind), **changes)
     return resolved
+
+
+def _reads_normalized(network: str) -> bool:
+    # Imported here: to look at a run without playing it takes no PyTorch.
+    from rl2grid.algorithms.networks import find_network
+
+    return find_network(network).reads_normalized
 
 
 def find_limits(args: RunArgs) -> dict[str, float]:

@@ -14,16 +14,20 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Self
 
+import numpy as np
 import torch
-from torch import nn
+from torch import Tensor, nn
 
-from rl2grid.envs.spec import Spec, spec_from_state
+from rl2grid.arrays import I64
+from rl2grid.envs.spec import JointActions, Spec, spec_from_state
 from rl2grid.errors import UsageError, one_of
+from rl2grid.grids.rankings import ranking
+from rl2grid.mdp.actions import ActionCatalogue, full_size
 
 
 @dataclass(frozen=True)
@@ -125,7 +129,11 @@ class Network:
     """Whether it is for tasks of rl2grid alone, whose ``Spec`` has a grid."""
 
 
-_IN_PACKAGE = {"mlp": "rl2grid.algorithms.networks.mlp"}
+_IN_PACKAGE = {
+    "mlp": "rl2grid.algorithms.networks.mlp",
+    "action-embedding": "rl2grid.algorithms.networks.action_embedding",
+    "gnn": "rl2grid.algorithms.networks.gnn",
+}
 """The file of each, whose ``NETWORK`` describes it."""
 _ADDED: dict[str, Network] = {}
 GROUP = "rl2grid.networks"
@@ -172,6 +180,59 @@ def find_network(name: str) -> Network:
     return network
 
 
+NEVER = -1e8
+"""Logit or value of an action that is not on the shortlist: probability exactly zero in float32, and yet finite."""
+
+
+def shortlist(spec: Spec, size: int) -> I64:
+    """The actions among which a policy with a shortlist chooses, ascending int64 [action].
+
+    Do nothing and the best-ranked topology actions, ``size`` together, and, of a flattened joint task, all moves of
+    controls.
+
+    Raises:
+        UsageError: actions are continuous or of no grid, or there are not as many.
+    """
+    actions = spec.actions.topology if isinstance(spec.actions, JointActions) else spec.actions
+    if spec.continuous or not isinstance(actions, ActionCatalogue) or spec.grid is None:
+        raise UsageError("Only the discrete actions of tasks of rl2grid have a shortlist: leave it out.")
+    if not 1 <= size <= len(actions):
+        raise UsageError(
+            f"shortlist={size} is not allowed: choose from 1 to {len(actions):,}, the actions of the task."
+        )
+    best = np.arange(size)
+    if len(actions) == full_size(spec.grid.sub_info.tolist(), spec.grid.n_line):  # in the order of the catalogue
+        best = np.sort(np.concatenate(([0], ranking(spec.grid.id).ids[: size - 1])))
+    return np.concatenate((best, np.arange(len(actions), spec.action_size))).astype(np.int64)
+
+
+class _Shortlisted(nn.Module):
+    """A network of the actions on the shortlist, which never plays another one."""
+
+    def __init__(self, request: Request, chosen: I64, build: Callable[[Request], nn.Module]) -> None:
+        super().__init__()
+        spec = request.spec
+        actions: Any = spec.actions
+        if isinstance(actions, JointActions):
+            topology = chosen[chosen < len(actions.topology)].astype(np.int32)
+            actions = JointActions(actions.topology.take(topology), actions.injection)
+        else:
+            actions = actions.take(chosen.astype(np.int32))
+        self.network = build(replace(request, spec=replace(spec, action_size=len(chosen), actions=actions)))
+        self.output, self.n_actions = request.output, spec.action_size
+        self.register_buffer("chosen", torch.from_numpy(chosen), persistent=False)
+
+    chosen: Tensor
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """Numbers [batch, inputs] -> [batch, width]."""
+        numbers = self.network(inputs)
+        first, per_action = self.output.per_state, self.output.per_action
+        of_actions = numbers[:, first:].unflatten(1, (per_action, len(self.chosen)))
+        every = numbers.new_full((len(inputs), per_action, self.n_actions), NEVER)
+        return torch.cat([numbers[:, :first], every.index_copy(2, self.chosen, of_actions).flatten(1)], dim=1)
+
+
 @dataclass(frozen=True)
 class NetworkFactory:
     """Makes networks of one kind for one task."""
@@ -181,13 +242,16 @@ class NetworkFactory:
     """Of the kind; see :func:`network_names`."""
     generator: torch.Generator | None = None
     """The source of all random weights; None: they will be loaded."""
+    shortlist: int | None = None
+    """Actions among which is chosen, see :func:`shortlist`; None: all."""
 
     def __post_init__(self) -> None:
         """Refuse what cannot be made.
 
         Raises:
-            UsageError: there is no such network, or it needs a grid where there is none.
+            UsageError: there is no such network, it needs a grid where there is none, or the shortlist is impossible.
         """
+        self.shortlisted()
         if find_network(self.name).needs_grid and self.spec.grid is None:
             raise UsageError(f"Network {self.name!r} is for tasks of rl2grid: this environment has no grid.")
 
@@ -204,13 +268,21 @@ class NetworkFactory:
         """
         first = None
         if do_nothing is not None:
-            first = math.log(do_nothing / (1.0 - do_nothing) * (self.spec.action_size - 1))
+            chosen = self.shortlisted()
+            others = (self.spec.action_size if chosen is None else len(chosen)) - 1
+            first = math.log(do_nothing / (1.0 - do_nothing) * max(others, 1))
         request = Request(self.spec, output, tuple(layers), style, first, self.generator)
-        return find_network(self.name).build(request)
+        build, chosen = find_network(self.name).build, self.shortlisted()
+        return build(request) if chosen is None or not output.per_action else _Shortlisted(request, chosen, build)
+
+    def shortlisted(self) -> I64 | None:
+        """The actions among which is chosen; None: all."""
+        return None if self.shortlist is None else shortlist(self.spec, self.shortlist)
 
     def state_dict(self) -> dict[str, Any]:
         """Plain values from which :meth:`from_state` makes it again."""
-        return {"name": self.name, "spec": self.spec.state_dict()}
+        chosen = {} if self.shortlist is None else {"shortlist": self.shortlist}
+        return {"name": self.name, "spec": self.spec.state_dict(), **chosen}
 
     @classmethod
     def from_state(cls, state: Mapping[str, Any]) -> Self:
@@ -219,4 +291,4 @@ class NetworkFactory:
         Raises:
             UsageError: there is no such network or task any more.
         """
-        return cls(spec_from_state(state["spec"]), state["name"])
+        return cls(spec_from_state(state["spec"]), state["name"], shortlist=state.get("shortlist"))
