@@ -111,16 +111,38 @@ class PolicyAgent:
 
     def act(self, observation: Observation, info: Info) -> Action:
         """The action for an observation: its id, or float32 [dimensions] in [-1, 1], or a joint action."""
-        if self._normalizer is not None:
-            observation = self._normalizer.normalize(observation)
-        masks = torch.as_tensor(self._env.action_masks()).unsqueeze(0) if self._mask_actions else None
+        observations, masks = self._seen = self._inputs(observation)
         with torch.no_grad():
-            observations = torch.as_tensor(observation, dtype=torch.float32).unsqueeze(0)
             actions = self._network.act(observations, masks, None if self.deterministic else self._generator)
-        self._seen = observations, masks
         if self._network.continuous:
             return self._as_action(actions[0].clamp(-1.0, 1.0).numpy())
         return self._as_action(int(actions[0]))
+
+    @property
+    def continuous(self) -> bool:
+        """Whether its actions are continuous."""
+        return bool(self._network.continuous)
+
+    @property
+    def preference(self) -> str:
+        """What it prefers actions by: ``probability`` or ``value``."""
+        return str(self._network.preference)
+
+    def best(self, observation: Observation, k: int) -> tuple[list[Action], list[float]]:
+        """The ``k`` legal discrete actions that it prefers, the best first, and its preferences; fewer if there are."""
+        observations, masks = self._seen = self._inputs(observation)
+        legal = torch.as_tensor(self._env.action_masks())
+        with torch.no_grad():
+            values = self._network.preferences(observations, masks)[0]
+        chosen = values.masked_fill(~legal, -torch.inf).topk(min(k, int(legal.sum())))
+        return [self._as_action(action) for action in chosen.indices.tolist()], chosen.values.tolist()
+
+    def _inputs(self, observation: Observation) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """An observation as the network reads it, and the actions that it may play, each with one row."""
+        if self._normalizer is not None:
+            observation = self._normalizer.normalize(observation)
+        masks = torch.as_tensor(self._env.action_masks()).unsqueeze(0) if self._mask_actions else None
+        return torch.as_tensor(observation, dtype=torch.float32).unsqueeze(0), masks
 
     def _as_action(self, action: Action) -> Action:
         """What the environment takes, of an action that the policy knows."""

@@ -53,6 +53,9 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--seconds", type=float, default=None, help="that the planner may search per decision; by default unlimited"
     )
+    parser.add_argument(
+        "--top-k", type=int, default=None, help="best actions of a policy of which the what-if chooses; by default 1"
+    )
     parser.add_argument("--output", type=Path, default=None, help="folder of the results of one agent")
     add_scores_flag(parser)
     parser.set_defaults(run=_run)
@@ -68,7 +71,7 @@ def _run(options: argparse.Namespace, output: Output) -> int:
     if options.output is not None and len(agents) > 1:
         raise UsageError("--output is the folder of one agent: leave it out, and each gets a folder of its own.")
     # Before anything is played: one that does not exist would be found after an hour of others.
-    made = [_made(agent, task, options.seconds) for agent in agents]
+    made = [_made(agent, task, options) for agent in agents]
     results = [_evaluated(agent, one, task, options, output) for agent, one in zip(agents, made, strict=True)]
     summaries = [result.summary for result in results]
     records = [asdict(result.summary) | {"foresight": result.foresight, "folder": result.folder} for result in results]
@@ -95,12 +98,18 @@ def _run(options: argparse.Namespace, output: Output) -> int:
     return 0
 
 
-def _made(agent: str, task: Task, seconds: float | None) -> Agent:
-    if seconds is None:
-        return make_agent(agent, task)
+def _made(agent: str, task: Task, options: argparse.Namespace) -> Agent:
+    if options.seconds is None:
+        return make_agent(agent, task, top_k=options.top_k)
     if agent != "planner":
         raise UsageError(f"--seconds is for the agent planner, which searches: leave it out for {agent}.")
-    return Planner(seconds=seconds)
+    return Planner(seconds=options.seconds)
+
+
+def _own_flags(options: argparse.Namespace) -> dict[str, str]:
+    """Flags that say how an agent decides, and their values."""
+    flags = {"seconds": options.seconds, "top-k": options.top_k}
+    return {name: f"{value:g}" for name, value in flags.items() if value is not None}
 
 
 def _name_of_last(agent: str, made: Agent) -> str | None:
@@ -112,9 +121,9 @@ def _name_of_last(agent: str, made: Agent) -> str | None:
 def _evaluated(agent: str, made: Agent, task: Task, options: argparse.Namespace, output: Output) -> Evaluation:
     chosen = keywords.given(options)
     command = evaluate_command(agent, task, options.split, options.seeds, options.months, chosen)
-    timed = options.seconds is not None
+    own = _own_flags(options)
     return evaluate(
-        made if timed else agent,
+        made if own else agent,
         task,
         split=options.split,
         scenarios=None if options.months is None else first_months(task, options.split, options.months),
@@ -123,7 +132,7 @@ def _evaluated(agent: str, made: Agent, task: Task, options: argparse.Namespace,
         output=options.output or _default_output(agent, made, options, task, chosen),
         progress=output.talks,
         name=_name_of_last(agent, made),
-        command=f"{command} --seconds {options.seconds:g}" if timed else command,
+        command=" ".join([command, *(f"--{name} {value}" for name, value in own.items())]),
         **chosen,
     )
 
@@ -148,8 +157,7 @@ def _default_output(
         parts.append(str(chosen["heuristic"]))
     if options.months is not None:
         parts.append(f"{options.months}-months")
-    if options.seconds is not None:
-        parts.append(f"{options.seconds:g}-seconds")
+    parts += [f"{value}-{name}" for name, value in _own_flags(options).items()]
     parts += [flag.removeprefix("--") for flag in environment_flags({**chosen, "heuristic": None})]
     name = "-".join(parts)
     path = Path(agent)

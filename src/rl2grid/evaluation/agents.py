@@ -15,7 +15,7 @@ from rl2grid.agents.planner import Planner
 from rl2grid.agents.random_agent import RandomAgent
 from rl2grid.agents.recovery import Recovery
 from rl2grid.envs.tasks import Task
-from rl2grid.errors import one_of
+from rl2grid.errors import UsageError, one_of
 from rl2grid.evaluation.own_agents import is_own, load_own_agent
 from rl2grid.mdp.features import KINDS
 
@@ -38,17 +38,21 @@ def kinds_of(name: str) -> tuple[str, ...]:
     return agent.kinds if isinstance(agent, SpecialisedAgent) else KINDS
 
 
-def make_agent(spec: str | Path, task: Task | None = None) -> Agent:
+def make_agent(spec: str | Path, task: Task | None = None, *, top_k: int | None = None) -> Agent:
     """The agent that ``spec`` asks for.
 
     Args:
         spec: a name of :data:`AGENTS`, the path of a checkpoint or of a run folder, or where an agent of one's own is
             written, as ``package.module:Agent`` or ``./agent.py`` (:mod:`rl2grid.evaluation.own_agents`).
         task: the task that the agent is to play; checkpoints of other tasks are refused.
+        top_k: of a policy: how many of its best actions the what-if compares (:class:`rl2grid.algorithms.top_k.TopK`);
+            None: it plays its best.
 
     Raises:
-        UsageError: there is no such agent, or it cannot play the task.
+        UsageError: there is no such agent, it cannot play the task, or it is no policy and ``top_k`` was given.
     """
+    if top_k is not None and (str(spec) in AGENTS or is_own(str(spec))):
+        raise UsageError(f"top_k compares the best actions of a trained policy: leave it out for {spec}.")
     if isinstance(spec, str) and spec in AGENTS:
         return AGENTS[spec]()
     if is_own(str(spec)):
@@ -60,4 +64,9 @@ def make_agent(spec: str | Path, task: Task | None = None) -> Agent:
     # Imported here: agents without training run without torch.
     from rl2grid.algorithms.policy_agent import load_agent
 
-    return load_agent(path, task)
+    policy = load_agent(path, task)
+    if top_k is None:
+        return policy
+    from rl2grid.algorithms.top_k import TopK
+
+    return TopK(policy, top_k)

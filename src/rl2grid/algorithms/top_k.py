@@ -1,0 +1,83 @@
+"""A policy that looks before it acts: of its best actions, the one that the what-if prefers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from rl2grid.agents.agent import Action, Considered, Info, Observation
+from rl2grid.agents.dispatch import worst_loading
+from rl2grid.algorithms.policy_agent import PolicyAgent
+from rl2grid.arrays import F64
+from rl2grid.errors import UsageError
+from rl2grid.mdp.heuristics import SAFE_RHO
+
+
+class TopK:
+    """Plays the first of a policy's ``k`` best legal actions that the forecast calls safe.
+
+    Safe is what leaves every line below 95% in the next step. Where none of them does, the one with the least worst
+    loading is played. With ``k`` = 1 it is the policy. A topology task on the native engine asks one what-if for all
+    ``k`` (:meth:`PowerGridEnv.what_if`), others one ``simulate`` each.
+
+    Args:
+        policy: a policy with discrete actions, not bound yet.
+        k: actions that are compared.
+
+    Raises:
+        UsageError: ``k`` is below 1.
+    """
+
+    def __init__(self, policy: PolicyAgent, k: int) -> None:
+        if k < 1:
+            raise UsageError(f"top_k={k} is not allowed: give a number of actions, at least 1.")
+        self._policy, self._k = policy, k
+        self.name = f"{policy.name}, best of {k}"
+        self.task, self.env_keywords = policy.task, policy.env_keywords
+        self.identity: dict[str, Any] = {**policy.identity, "top_k": k}
+
+    def bind(self, env: gymnasium.Env[Any, Any]) -> None:
+        """Remember the environment, which is asked for forecasts.
+
+        Raises:
+            UsageError: the policy cannot play the task, or its actions are continuous.
+        """
+        self._policy.bind(env)
+        if self._policy.continuous:
+            raise UsageError("A policy with continuous actions has no best few of them: leave top_k out.")
+        base: Any = env.unwrapped
+        self._env = base
+        self._asks_at_once = base.task.kind == "T" and base.options.engine == "native"
+
+    def reset(self, i: int) -> None:
+        """Nothing to forget."""
+        self._policy.reset(i)
+
+    def act(self, observation: Observation, info: Info) -> Action:
+        """The action to play."""
+        candidates, preferences = self._policy.best(observation, self._k)
+        loading = self._loading(candidates) if len(candidates) > 1 else np.zeros(1)
+        safe = np.flatnonzero(loading < SAFE_RHO)
+        chosen = int(safe[0]) if len(safe) else int(loading.argmin())
+        self._considered = Considered(self._policy.preference, candidates, preferences, _why(chosen, len(safe) > 0))
+        return candidates[chosen]
+
+    def explain(self) -> Considered | None:
+        """The candidates of the last decision by the policy's preference, and why one of them was played."""
+        return self._considered
+
+    def _loading(self, candidates: list[Action]) -> F64:
+        """The worst loading in the next step after each, by the forecast; infinite where the game would be lost."""
+        if self._asks_at_once:
+            return np.asarray(self._env.what_if(candidates).worst_loading, np.float64)
+        return np.array([worst_loading(self._env, action) for action in candidates])
+
+
+def _why(chosen: int, is_safe: bool) -> str:
+    if is_safe:
+        return (
+            "the policy's choice is safe by the forecast" if chosen == 0 else "the first that the forecast calls safe"
+        )
+    return "by the forecast none of the candidates is safe: the one with the least worst loading"
