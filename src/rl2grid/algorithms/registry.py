@@ -23,7 +23,7 @@ import gymnasium
 from rl2grid.errors import UsageError, one_of
 
 if TYPE_CHECKING:
-    from rl2grid.algorithms.trainer import Trainer
+    from rl2grid.algorithms.trainer import Learner
 
 VectorEnvironment = gymnasium.vector.VectorEnv[Any, Any, Any]
 
@@ -63,7 +63,7 @@ class Algorithm:
     args: type[Any]
     """Its :class:`Hyperparameters`, a frozen dataclass, such as
     :class:`~rl2grid.algorithms.hyperparameters.SharedArgs` and what is made of it."""
-    trainer: Callable[[Any, VectorEnvironment], Trainer]
+    trainer: Callable[[Any, VectorEnvironment], Learner]
     """Made of hyperparameters and environments."""
     kinds: tuple[str, ...]
     """Kinds of task that it can learn: ``"T"`` (discrete actions), ``"R"`` (continuous actions). Joint tasks it learns

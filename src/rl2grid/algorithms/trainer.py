@@ -1,4 +1,5 @@
-"""What all trainers have in common: a step of every environment and the account of it, budget, checkpoints.
+"""What all trainers have in common: budget and checkpoints (:class:`Learner`), and of those that play, a step of every
+environment and the account of it (:class:`Trainer`).
 
 Transitions of varying length
     Between two decisions the grid makes n_k >= 1 steps (a heuristic plays the others): a semi-Markov decision
@@ -41,7 +42,7 @@ from rl2grid.algorithms.playing import (
     resume_environments,
 )
 from rl2grid.envs.normalization import CLIP, ObservationNormalizer
-from rl2grid.envs.spec import spec_of
+from rl2grid.envs.spec import Spec, spec_of
 from rl2grid.errors import UsageError
 
 
@@ -69,31 +70,31 @@ class Played(NamedTuple):
         return [self.infos["final_obs"][i] for i in np.flatnonzero(self.completed)]
 
 
-class Trainer(ABC):
-    """One training run: ``iterate`` until ``finished``; ``state_dict`` between two iterations holds all of it."""
+class Learner(ABC):
+    """What learns: ``iterate`` until ``finished``; ``state_dict`` between two iterations holds all of it."""
 
     deterministic_on: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
     """Types of device on which only PyTorch's deterministic algorithms are used."""
 
-    def __init__(self, args: SharedArgs, envs: VectorEnv[Any, Any, Any]) -> None:
-        """Everything but the networks; the environments are reset at the first iteration.
+    def __init__(self, args: SharedArgs, spec: Spec) -> None:
+        """Everything but the networks.
+
+        Args:
+            args: Hyperparameters.
+            spec: What is observed and what can be done.
 
         Raises:
-            UsageError: the environments cannot be learned with these hyperparameters.
+            UsageError: the network cannot read what these hyperparameters give it.
         """
         torch.set_num_threads(args.torch_threads)
         self.args = args
         self.device = find_device(args.device)
         # The same as use_deterministic_algorithms, which loads PyTorch's compilers too: 1.3 s, 6 s without byte code.
         torch.set_deterministic_debug_mode("error" if self.device.type in self.deterministic_on else "default")
-        self.continuous = check_environments(
-            args.algorithm, envs, num_envs=args.num_envs, mask_actions=args.mask_actions
-        )
-        check_discount(args.algorithm, envs, args.gamma)
-        self.envs = envs
         self.generator = torch.Generator().manual_seed(args.seed)
-        self.spec = spec_of(envs)
-        self.observation_size, self.action_size = self.spec.observation_size, self.spec.action_size
+        self.spec = spec
+        self.continuous = spec.continuous
+        self.observation_size, self.action_size = spec.observation_size, spec.action_size
         if args.normalize_observations and not find_network(args.network).reads_normalized:
             raise UsageError(
                 f"Network {args.network!r} reads observations as the environment gives them: set "
@@ -108,14 +109,9 @@ class Trainer(ABC):
         self.num_iterations = args.total_timesteps // (args.num_envs * args.num_steps)
         self.iteration = 0
         self.decisions = 0
-        """Decisions made so far, over all environments."""
+        """Decisions learned from so far, over all environments."""
         self.grid_steps = 0
-        """Grid steps behind them."""
-        self.observations: NDArray[np.float32] | None = None
-        """What the environments show, as they give it."""
-        self._over = np.zeros(args.num_envs, np.bool_)
-        self._episode_return = np.zeros(args.num_envs, np.float64)
-        self._episode_length = np.zeros(args.num_envs, np.int64)
+        """Grid steps behind them, as far as they were played here."""
 
     def _on_shortlist(self) -> NDArray[np.bool_] | None:
         """Which actions are on the shortlist, bool [action]; None: there is none.
@@ -151,9 +147,13 @@ class Trainer(ABC):
         """Where files may be kept that ``state_dict`` only refers to, before the first iteration; most need none."""
         return
 
+    def identity(self) -> dict[str, Any]:
+        """What results must name beside versions and hashes of the task: what it learns from that is stored elsewhere."""
+        return {}
+
     @abstractmethod
     def iterate(self) -> dict[str, float]:
-        """Play ``num_steps`` decisions in every environment, learn, and return the metrics."""
+        """Learn from ``num_steps`` decisions per environment, and return the metrics."""
 
     @abstractmethod
     def learned(self) -> Mapping[str, nn.Module | torch.optim.Optimizer]:
@@ -187,6 +187,74 @@ class Trainer(ABC):
             "iteration": self.iteration,
             "decisions": self.decisions,
             "grid_steps": self.grid_steps,
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on where ``state_dict`` was called, bit for bit.
+
+        Raises:
+            UsageError: what it learns from is not where it was.
+        """
+        for name, part in self.learned().items():
+            part.load_state_dict(state[name])
+        if self.normalizer is not None:
+            self.normalizer.load_state_dict(state["normalizer"])
+            self._scale_of = -1
+        self.generator.set_state(state["generator"])
+        self.iteration, self.decisions = state["iteration"], state["decisions"]
+        self.grid_steps = state["grid_steps"]
+
+    def tensor(self, values: Any, dtype: torch.dtype | None = None) -> Tensor:
+        """A copy of an array on the networks' device."""
+        return torch.tensor(values, dtype=dtype, device=self.device)
+
+    def moved(self, values: NDArray[Any]) -> Tensor:
+        """An array on the networks' device, the same memory if that is the processor's."""
+        return torch.from_numpy(np.ascontiguousarray(values)).to(self.device)
+
+    def normalized(self, observations: NDArray[np.float32]) -> Tensor:
+        """Observations [..., size] as networks read them, by the statistics of this moment.
+
+        In float32, and therefore rounded otherwise than by :meth:`ObservationNormalizer.normalize`; a tensor of its own
+        unless observations are not scaled.
+        """
+        given = self.moved(observations)
+        if self.normalizer is None:
+            return given
+        if self._scale_of != self.normalizer.count:
+            self._scale_of = self.normalizer.count
+            self._mean = self.tensor(self.normalizer.mean, torch.float32)
+            self._factor = self.tensor(1.0 / self.normalizer.deviation, torch.float32)
+        return ((given - self._mean) * self._factor).clamp_(-CLIP, CLIP)
+
+
+class Trainer(Learner):
+    """What learns from what it plays."""
+
+    def __init__(self, args: SharedArgs, envs: VectorEnv[Any, Any, Any]) -> None:
+        """Everything but the networks; the environments are reset at the first iteration.
+
+        Raises:
+            UsageError: the environments cannot be learned with these hyperparameters.
+        """
+        check_environments(args.algorithm, envs, num_envs=args.num_envs, mask_actions=args.mask_actions)
+        check_discount(args.algorithm, envs, args.gamma)
+        super().__init__(args, spec_of(envs))
+        self.envs = envs
+        self.observations: NDArray[np.float32] | None = None
+        """What the environments show, as they give it."""
+        self._over = np.zeros(args.num_envs, np.bool_)
+        self._episode_return = np.zeros(args.num_envs, np.float64)
+        self._episode_length = np.zeros(args.num_envs, np.int64)
+
+    @abstractmethod
+    def iterate(self) -> dict[str, float]:
+        """Play ``num_steps`` decisions in every environment, learn, and return the metrics."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that is needed to go on, after an iteration."""
+        return {
+            **super().state_dict(),
             "observations": np.array(self.observations),
             "over": self._over,
             "episode_return": self._episode_return,
@@ -200,14 +268,7 @@ class Trainer(ABC):
         Raises:
             UsageError: the environments, played again, are not where they were.
         """
-        for name, part in self.learned().items():
-            part.load_state_dict(state[name])
-        if self.normalizer is not None:
-            self.normalizer.load_state_dict(state["normalizer"])
-            self._scale_of = -1
-        self.generator.set_state(state["generator"])
-        self.iteration, self.decisions = state["iteration"], state["decisions"]
-        self.grid_steps = state["grid_steps"]
+        super().load_state_dict(state)
         self.observations = np.array(state["observations"])
         self._over = np.array(state["over"])
         self._episode_return = np.array(state["episode_return"])
@@ -264,26 +325,3 @@ class Trainer(ABC):
         self.observations = np.array(observations, np.float32)
         if self.normalizer is not None:
             self.normalizer.update(self.observations)
-
-    def tensor(self, values: Any, dtype: torch.dtype | None = None) -> Tensor:
-        """A copy of an array on the networks' device."""
-        return torch.tensor(values, dtype=dtype, device=self.device)
-
-    def moved(self, values: NDArray[Any]) -> Tensor:
-        """An array on the networks' device, the same memory if that is the processor's."""
-        return torch.from_numpy(np.ascontiguousarray(values)).to(self.device)
-
-    def normalized(self, observations: NDArray[np.float32]) -> Tensor:
-        """Observations [..., size] as networks read them, by the statistics of this moment.
-
-        In float32, and therefore rounded otherwise than by :meth:`ObservationNormalizer.normalize`; a tensor of its own
-        unless observations are not scaled.
-        """
-        given = self.moved(observations)
-        if self.normalizer is None:
-            return given
-        if self._scale_of != self.normalizer.count:
-            self._scale_of = self.normalizer.count
-            self._mean = self.tensor(self.normalizer.mean, torch.float32)
-            self._factor = self.tensor(1.0 / self.normalizer.deviation, torch.float32)
-        return ((given - self._mean) * self._factor).clamp_(-CLIP, CLIP)

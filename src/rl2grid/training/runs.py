@@ -31,7 +31,7 @@ from rl2grid.algorithms.checkpoint import load_checkpoint, save_checkpoint
 from rl2grid.algorithms.metrics import MetricsWriter
 from rl2grid.algorithms.policy_agent import BEST_FILE, CHECKPOINT_FILE, PolicyAgent
 from rl2grid.algorithms.registry import VectorEnvironment, find_algorithm
-from rl2grid.algorithms.trainer import Trainer
+from rl2grid.algorithms.trainer import Learner
 from rl2grid.envs.joint import VectorJointAsBox, VectorJointAsDiscrete
 from rl2grid.envs.options import changed_options
 from rl2grid.envs.registration import register_all
@@ -194,7 +194,7 @@ class _Run:
         folder: Path,
         args: RunArgs,
         identity: Mapping[str, Any],
-        trainer: Trainer,
+        trainer: Learner,
         evaluate: Evaluate | None,
     ) -> None:
         self.folder = folder
@@ -323,7 +323,7 @@ def _run(run: _Run, envs: VectorEnvironment, limit: TimeLimit, checkpoint: Mappi
 
 
 @contextmanager
-def _accounted(folder: Path, trainer: Trainer, envs: VectorEnvironment) -> Iterator[EnergyAccount]:
+def _accounted(folder: Path, trainer: Learner, envs: VectorEnvironment) -> Iterator[EnergyAccount]:
     """The energy account of a run, complete at the end; closes the environments."""
     account, decisions = EnergyAccount(folder), trainer.decisions
     try:
@@ -335,7 +335,7 @@ def _accounted(folder: Path, trainer: Trainer, envs: VectorEnvironment) -> Itera
             account.finish()
 
 
-def _budget(args: RunArgs, trainer: Trainer) -> int:
+def _budget(args: RunArgs, trainer: Learner) -> int:
     """Decisions of the whole run: the largest number of full iterations within the request."""
     return trainer.num_iterations * args.hyperparameters.num_envs * args.hyperparameters.num_steps
 
