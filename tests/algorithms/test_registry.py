@@ -20,7 +20,7 @@ from rl2grid.errors import UsageError
 from rl2grid.studies.tuning import WEIGHT_CHOICES, search_space
 from rl2grid.training.request import hyperparameters
 
-OURS = ("ppo", "lagrangian-ppo", "dqn", "sac", "td3")
+OURS = ("ppo", "lagrangian-ppo", "dqn", "sac", "td3", "imitation")
 
 
 @dataclass(frozen=True)
@@ -61,8 +61,8 @@ def test_each_is_found_by_its_name(name: str):
 
 def test_kinds_of_tasks_and_names():
     assert algorithm_names() == OURS
-    assert algorithms_for("T") == ("ppo", "lagrangian-ppo", "dqn", "sac")
-    assert algorithms_for("R") == ("ppo", "lagrangian-ppo", "sac", "td3")
+    assert algorithms_for("T") == ("ppo", "lagrangian-ppo", "dqn", "sac", "imitation")
+    assert algorithms_for("R") == ("ppo", "lagrangian-ppo", "sac", "td3", "imitation")
     with pytest.raises(UsageError, match="'a2c' does not exist: choose one of ppo, lagrangian-ppo, dqn, sac, td3"):
         find_algorithm("a2c")
 

@@ -95,7 +95,7 @@ class OnPolicyArgs(SharedArgs):
 
 # --- Networks -------------------------------------------------------------------------------------------------------
 
-_ILLEGAL_LOGIT = -1e8
+ILLEGAL_LOGIT = -1e8
 """Probability exactly zero in float32, and yet finite, so that zero times its logarithm is zero."""
 
 
@@ -152,7 +152,7 @@ class ActorCritic(nn.Module):
             if generator is None:
                 return mean
             return mean + self.log_std.exp() * torch.randn(mean.shape, generator=generator).to(mean.device)
-        log_probabilities = _log_probabilities(output, masks)
+        log_probabilities = legal_log_softmax(output, masks)
         if generator is None:
             return log_probabilities.argmax(dim=-1)
         return drawn(log_probabilities.exp(), generator).to(output.device)
@@ -164,13 +164,13 @@ class ActorCritic(nn.Module):
             noise = torch.randn(output.shape, generator=generator).to(output.device)
             actions = output + self.log_std.exp() * noise
             return actions, self._log_densities(output, actions)
-        log_probabilities = _log_probabilities(output, masks)
+        log_probabilities = legal_log_softmax(output, masks)
         actions = drawn(log_probabilities.exp(), generator).to(output.device)
         return actions, log_probabilities.gather(-1, actions.unsqueeze(-1)).squeeze(-1)
 
     def preferences(self, observations: Tensor, masks: Tensor | None) -> Tensor:
         """Probabilities of discrete actions, [batch, actions]."""
-        return _log_probabilities(self.actor(observations), masks).exp()
+        return legal_log_softmax(self.actor(observations), masks).exp()
 
     def log_probability_and_entropy(
         self, observations: Tensor, actions: Tensor, masks: Tensor | None
@@ -180,7 +180,7 @@ class ActorCritic(nn.Module):
         if self.continuous:
             entropy = (self.log_std + 0.5 * math.log(2 * math.pi * math.e)).sum()
             return self._log_densities(output, actions), entropy.expand(len(actions))
-        log_probabilities = _log_probabilities(output, masks)
+        log_probabilities = legal_log_softmax(output, masks)
         entropies = -(log_probabilities.exp() * log_probabilities).sum(dim=-1)
         return log_probabilities.gather(-1, actions.unsqueeze(-1)).squeeze(-1), entropies
 
@@ -191,9 +191,10 @@ class ActorCritic(nn.Module):
         return log_densities.sum(dim=-1)
 
 
-def _log_probabilities(logits: Tensor, masks: Tensor | None) -> Tensor:
+def legal_log_softmax(logits: Tensor, masks: Tensor | None) -> Tensor:
+    """Log-probabilities [batch, actions] of logits and legal actions of the same shape; illegal: large and negative."""
     if masks is not None:
-        logits = logits.masked_fill(~masks, _ILLEGAL_LOGIT)
+        logits = logits.masked_fill(~masks, ILLEGAL_LOGIT)
     return logits.log_softmax(dim=-1)
 
 

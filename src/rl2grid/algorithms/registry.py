@@ -77,6 +77,8 @@ class Algorithm:
     find_limits: Callable[[Any, str | None], dict[str, float]] | None = None
     """Of algorithms with constraints of their own: ``find_limits(args, constraint of the task)`` tells what the costs
     of a safe episode may reach, by constraint; None: the task's constraint is all there is."""
+    joint_as_box: bool = False
+    """Whether joint tasks are learned with continuous actions although discrete ones could be learned, too."""
 
     def learns(self, kind: str) -> bool:
         """Whether it can learn tasks of a kind, of :data:`rl2grid.mdp.features.KINDS`."""
@@ -86,9 +88,9 @@ class Algorithm:
         """Whether it learns tasks of a kind with continuous actions.
 
         Joint tasks are learned as :class:`~rl2grid.envs.joint.JointAsDiscrete` by whom discrete actions are learned at
-        all, else as :class:`~rl2grid.envs.joint.JointAsBox`.
+        all, unless :attr:`joint_as_box` says otherwise, else as :class:`~rl2grid.envs.joint.JointAsBox`.
         """
-        return kind == "R" or (kind == "H" and "T" not in self.kinds)
+        return kind == "R" or (kind == "H" and (self.joint_as_box or "T" not in self.kinds))
 
     def type_hints(self) -> dict[str, Any]:
         """Type hint of every hyperparameter."""
@@ -102,6 +104,7 @@ _IN_PACKAGE = {
     "dqn": "rl2grid.algorithms.dqn",
     "sac": "rl2grid.algorithms.sac",
     "td3": "rl2grid.algorithms.td3",
+    "imitation": "rl2grid.algorithms.imitation",
 }
 """The file of each, whose ``ALGORITHM`` describes it."""
 _ADDED: dict[str, Algorithm] = {}

@@ -148,7 +148,7 @@ class Learner(ABC):
         return
 
     def identity(self) -> dict[str, Any]:
-        """What results must name beside versions and hashes of the task: what it learns from that is stored elsewhere."""
+        """What results must name beside versions and hashes of the task: what it learns from and began with."""
         return {}
 
     @abstractmethod

@@ -181,6 +181,8 @@ class LabelsDescription:
     months: int
     rounds: int
     """The most of a folder: 1 without a pupil."""
+    rows: tuple[MonthRow, ...]
+    """The months, in the order of their labels."""
     identity: Mapping[str, Any]
     """``grid_hash``, ``action_set_hash``, ``observation_size``, ``versions``, and the hash of each folder's labels in
     ``labels``."""
@@ -259,6 +261,7 @@ def read_labels(folders: Sequence[Path], task_id: str) -> tuple[LabelsDescriptio
         env_keywords=_tuples(first["env_keywords"]),
         gamma=float(first["gamma"]),
         months=len(parts),
+        rows=tuple(row for row, _ in parts),
         rounds=max(len(each["rounds"]) for each in descriptions),
         identity={**first["identity"], "labels": [checksum(each) for each in descriptions]},
     ), labels

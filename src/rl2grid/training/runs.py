@@ -17,6 +17,7 @@ the same metrics as one that was not (times apart), on the same machine with the
 
 from __future__ import annotations
 
+import json
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -107,7 +108,7 @@ def train(
     envs = make_envs(args)
     try:
         trainer = find_algorithm(args.algorithm).trainer(args.hyperparameters, envs)
-        identity = identity_of(args)
+        identity = identity_of(args) | trainer.identity()
         run = _Run(folder, args, identity, trainer, evaluate)
         create_run_folder(folder, configuration_of(args, identity), run.save_beginning)
         with _locked(folder):
@@ -148,6 +149,12 @@ def resume(
         envs = make_envs(args)
         try:
             trainer = find_algorithm(args.algorithm).trainer(args.hyperparameters, envs)
+            for name, value in trainer.identity().items():
+                if json.loads(json.dumps(value)) != identity.get(name):
+                    raise UsageError(
+                        f"The run in {str(folder)!r} cannot be resumed: its {name} are no longer those it began with."
+                    )
+            now |= trainer.identity()
             run = _Run(folder, args, now, trainer, evaluate)
             if identity.get("versions") != now["versions"]:
                 run.note(f"library versions differ from those the run began with: {now['versions']}")

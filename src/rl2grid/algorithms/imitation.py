@@ -1,0 +1,618 @@
+"""Imitation: supervised learning of what a teacher decided, so that PPO or SAC can go on from there.
+
+What is learned from are labels of ``rl2grid teach`` (:mod:`rl2grid.records.labels`): states s_k, the teacher's action
+a_k there, what it thinks of the actions that it considered, how many decisions w_k the label stands for, and the
+discounted return G_k that followed as the episode was played.
+
+Topology actions
+    The policy minimises the cross-entropy - sum over a of q_k(a) log pi(a | s_k) over the legal actions, where
+
+        q_k = (1 - e) [(1 - m_k) 1(a = a_k) + m_k softmax(values_k / T)] + e / (number of legal actions)
+
+    with the temperature T (``soft_temperature``), the share m_k of the values (``soft_share``; 0 where the teacher told
+    none) and the share e of smoothing (``label_smoothing``).
+
+Continuous actions
+    Means are fitted to a_k by Huber's loss. The deviations, which exploration starts with, are those of the teacher's
+    actions around the means: the log-likelihood of a Gaussian, whose means are not moved by it, within
+    ``log_std_range``. Of SAC's policy that is the Gaussian before it is squashed.
+
+Joint tasks
+    are learned as :class:`~rl2grid.envs.joint.JointAsBox`, whose topology action is that of the largest of the first n
+    entries x: cross-entropy with the logits ``joint_scale`` * x, over all actions, because nothing is masked when it is
+    played, and what leaves [-1, 1] costs its square. Noise of deviation pi / (sqrt(6) ``joint_scale``) on the entries,
+    as wide as Gumbel's, draws about as those logits say. The other entries are learned as continuous actions.
+
+Weights
+    A label counts w_k times, and ``acting_weight`` times that where the teacher acts (any action but 0, or any
+    injection): where it rarely does, a policy that never acts would be nearly as good.
+
+Critic
+    V(s_k) of the policy ``ppo`` is fitted to (1 - gamma) G_k by squared errors, as PPO scales rewards.
+
+Held-out months
+    are not learned from; they tell when what is learned is the months and no longer the teacher. The best policy is
+    picked by how long it survives on validation months, as of every training.
+
+The budget counts labels, each as often as it is learned from. Their order is a pure function of the seed and the epoch.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+import torch
+from gymnasium.vector import VectorEnv
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from rl2grid.algorithms import on_policy, sac
+from rl2grid.algorithms.descent import Adam, descend
+from rl2grid.algorithms.diagnostics import explained_variance, mean
+from rl2grid.algorithms.hyperparameters import SharedArgs, changed_preset
+from rl2grid.algorithms.on_policy import ActorCritic
+from rl2grid.algorithms.playing import check_environments
+from rl2grid.algorithms.registry import Algorithm
+from rl2grid.algorithms.sac import CategoricalActor, GaussianActor
+from rl2grid.algorithms.trainer import Learner
+from rl2grid.arrays import F32, I64, Flags
+from rl2grid.envs.spec import Spec, spec_of
+from rl2grid.envs.tasks import find_task
+from rl2grid.errors import UsageError, one_of
+from rl2grid.records.labels import NO_CANDIDATE, Labels, LabelsDescription, read_labels
+from rl2grid.streams import Purpose, Stream
+
+ON_POLICY, SOFT = "ppo", "sac"
+POLICIES = (ON_POLICY, SOFT)
+ACTING_SHARE = 0.25
+"""What decisions in which the teacher acts have of all weight at least, if nothing else is asked for."""
+MOST_ACTING_WEIGHT = 20.0
+"""... unless they would have to count more than this."""
+CLOSE = 0.1
+"""Continuous actions agree if no entry differs by more."""
+
+# --- Hyperparameters ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Args(SharedArgs):
+    """Hyperparameters; the presets below change some of the values here."""
+
+    algorithm: ClassVar[str] = "Imitation"
+
+    labels: tuple[str, ...] = ()
+    """Folders of labels that 'rl2grid teach' wrote, of one task; at least one."""
+    policy: str = ON_POLICY
+    """Whose policy is learned: ``ppo``, with a critic, or ``sac``."""
+    total_timesteps: int = 2_000_000
+    """Labels to learn from, each as often as it is its turn; never exceeded."""
+    num_envs: int = 1
+    """No environment is played: 1."""
+    num_steps: int = 20_000
+    """Labels between two rows of metrics."""
+    batch_size: int = 256
+    """Labels per update."""
+    actor_learning_rate: float = 1e-3
+    """Adam's step size for the policy."""
+    critic_learning_rate: float = 1e-3
+    """Adam's step size for the critic."""
+    anneal_learning_rate: bool = True
+    """Whether both step sizes fall linearly to zero over the run."""
+    soft_share: float = 0.25
+    """Share of the teacher's values in what is imitated, where it tells any; the rest is its action."""
+    soft_temperature: float = 0.1
+    """Difference of two values that makes one action e times as desirable as the other."""
+    label_smoothing: float = 0.0
+    """Share of the legal actions, all alike, in what is imitated."""
+    acting_weight: float | None = None
+    """How much more decisions count in which the teacher acts; None: as much as makes them a quarter of all weight."""
+    holdout: float = 0.1
+    """Share of the months that are not learned from, but tell how well the rest was generalised."""
+    huber_delta: float = 0.1
+    """Continuous actions only: errors beyond this count linearly."""
+    log_std_range: tuple[float, float] = (-2.5, -0.5)
+    """Continuous actions only: bounds of the policy's log standard deviations."""
+    joint_scale: float = 10.0
+    """Joint tasks only: logit of an entry of 1."""
+    actor_layers: tuple[int, ...] = (128, 128)
+    """Widths of the policy's hidden layers (in an ``mlp`` tanh, of SAC's policy ReLU)."""
+    critic_layers: tuple[int, ...] = (128, 128)
+    """Widths of the value function's hidden layers (tanh, in an ``mlp``)."""
+
+    def __post_init__(self) -> None:
+        """Refuse values that cannot work; see :class:`SharedArgs`."""
+        super().__post_init__()
+        if self.num_envs != 1:
+            raise UsageError(f"Imitation plays no environments: leave num_envs at 1 instead of {self.num_envs}.")
+        if self.policy not in POLICIES:
+            raise one_of("Imitation's policy", self.policy, POLICIES)
+        self._check_counts("batch_size")
+        self._check_positive("actor_learning_rate", "critic_learning_rate", "soft_temperature", "huber_delta")
+        self._check_positive("joint_scale")
+        self._check_shares("soft_share", "label_smoothing", "holdout")
+        if self.acting_weight is not None:
+            self._check_positive("acting_weight")
+        if self.holdout == 1.0:
+            raise UsageError("Imitation needs a holdout below 1: no month would be left to learn from.")
+        low, high = self.log_std_range
+        if not -10.0 <= low <= high <= 2.0:
+            raise UsageError(f"Imitation needs a log_std_range within -10 and 2, not {self.log_std_range}.")
+        self._check_layers("actor_layers", "critic_layers")
+
+
+def default(*, continuous: bool) -> Args:
+    """Our own values; sizes and discount are those of the default of PPO, which can go on from there."""
+    if continuous:
+        return Args(mask_actions=False, gamma=0.99)
+    return Args(gamma=0.9)
+
+
+PRESETS: dict[str, Callable[..., Args]] = {"default": default}
+
+SEARCH_SPACE: dict[str, tuple[Any, ...]] = {
+    "batch_size": (128, 256, 1024),
+    "actor_learning_rate": (3e-3, 1e-3, 3e-4),
+    "soft_share": (0.0, 0.25, 0.5),
+    "label_smoothing": (0.0, 0.02),
+}
+"""Values among which a search tries by default; the paper imitates nothing."""
+
+
+def preset(name: str, *, continuous: bool, **changes: Any) -> Args:
+    """A preset for tasks with continuous or discrete actions, some values changed.
+
+    Raises:
+        UsageError: no such preset, or values that cannot work.
+    """
+    return changed_preset(PRESETS, "Imitation", name, continuous=continuous, **changes)
+
+
+# --- What is learned from -------------------------------------------------------------------------------------------
+
+
+class Batch(NamedTuple):
+    """Some labels, on the device of the network; every array is [batch, ...]."""
+
+    observations: Tensor
+    """float32, normalised"""
+    masks: Tensor | None
+    """bool, legal topology actions"""
+    topology: Tensor | None
+    """int64, the teacher's"""
+    injection: Tensor | None
+    """float32, the teacher's"""
+    candidates: Tensor
+    """int64 [batch, k], -1: none"""
+    values: Tensor
+    """float32 [batch, k]"""
+    stands_for: Tensor
+    """float32, decisions"""
+    weights: Tensor
+    """float32, what the loss multiplies it with: 1 in the mean of all that is learned from"""
+    acts: Tensor
+    """bool, whether the teacher acts"""
+    returns: Tensor
+    """float32, scaled"""
+
+
+class Examples:
+    """Labels on the device of a network, observations normalised."""
+
+    def __init__(self, labels: Labels, observations: Tensor, weights: F32, acts: Flags, reward_scale: float) -> None:
+        device = observations.device
+        self._actions = 0 if labels.masks is None else labels.masks.shape[1]
+        # One bit per action: levels have up to 73,357 of them.
+        self._masks = None if labels.masks is None else np.packbits(labels.masks, axis=1)
+        self._columns = {
+            "observations": observations,
+            "topology": None if labels.topology is None else torch.as_tensor(labels.topology, device=device),
+            "injection": None if labels.injection is None else torch.as_tensor(labels.injection, device=device),
+            "candidates": torch.as_tensor(labels.candidates, device=device),
+            "values": torch.as_tensor(labels.values, device=device),
+            "stands_for": torch.as_tensor(labels.weights, device=device),
+            "weights": torch.as_tensor(weights, device=device),
+            "acts": torch.as_tensor(acts, device=device),
+            "returns": torch.as_tensor((labels.returns * reward_scale).astype(np.float32), device=device),
+        }
+        self._device = device
+
+    def __len__(self) -> int:
+        return len(self._columns["acts"])  # type: ignore[arg-type]
+
+    def rows(self, chosen: I64) -> Batch:
+        """The labels with these indices."""
+        masks = None
+        if self._masks is not None:
+            unpacked = np.unpackbits(self._masks[chosen], axis=1, count=self._actions).view(np.bool_)
+            masks = torch.from_numpy(unpacked).to(self._device)
+        indices = torch.from_numpy(chosen).to(self._device)
+        columns = {name: None if each is None else each[indices] for name, each in self._columns.items()}
+        return Batch(masks=masks, **columns)  # type: ignore[arg-type]
+
+    def batches(self, size: int) -> Iterator[Batch]:
+        """All labels, in order."""
+        for first in range(0, len(self), size):
+            yield self.rows(np.arange(first, min(first + size, len(self))))
+
+
+def chosen_rows(labels: Labels, rows: NDArray[Any]) -> Labels:
+    """Some of the labels, by index or bool [n]."""
+    columns: dict[str, Any] = {each.name: getattr(labels, each.name) for each in fields(Labels)}
+    kept: dict[str, Any] = {name: None if column is None else column[rows] for name, column in columns.items()}
+    return Labels(**kept)
+
+
+def teacher_acts(labels: Labels) -> Flags:
+    """Where the teacher does anything, bool [n]."""
+    acts = np.zeros(len(labels), np.bool_)
+    if labels.topology is not None:
+        acts |= labels.topology != 0
+    if labels.injection is not None:
+        acts |= (labels.injection != 0.0).any(axis=1)
+    return acts
+
+
+def factor_of_acting(weights: F32, acts: Flags, asked_for: float | None) -> float:
+    """How much more decisions count in which the teacher acts (module docstring)."""
+    if asked_for is not None:
+        return asked_for
+    acting, resting = float(weights[acts].sum()), float(weights[~acts].sum())
+    if not acting:
+        return 1.0
+    return min(max(ACTING_SHARE / (1.0 - ACTING_SHARE) * resting / acting, 1.0), MOST_ACTING_WEIGHT)
+
+
+def held_out(scenarios: Sequence[str], share: float) -> frozenset[str]:
+    """The months that are not learned from: the same whoever acted in them, and whatever the seed of the run is.
+
+    At least one of several where the share is above 0, and never all.
+    """
+    months = sorted(set(scenarios), key=lambda month: hashlib.sha256(month.encode()).digest())
+    count = max(round(share * len(months)), 1) if share > 0.0 else 0
+    return frozenset(months[: min(count, len(months) - 1)])
+
+
+# --- What is optimised ----------------------------------------------------------------------------------------------
+
+
+def aims(batch: Batch, masks: Tensor | None, actions: int, args: Args) -> Tensor:
+    """The distribution q over topology actions that is imitated, [batch, actions] (equation above).
+
+    Args:
+        batch: Labels of topology actions.
+        masks: Actions that may have a probability, bool [batch, actions]; None: all.
+        actions: How many there are.
+        args: Hyperparameters.
+    """
+    assert batch.topology is not None
+    hard = nn.functional.one_hot(batch.topology, actions).to(torch.float32)
+    aim = hard
+    known = batch.candidates != NO_CANDIDATE
+    if args.soft_share and known.shape[1]:
+        values = (batch.values / args.soft_temperature).masked_fill(~known, on_policy.ILLEGAL_LOGIT)
+        liked = values.softmax(dim=-1) * known
+        soft = torch.zeros_like(hard).scatter_add_(-1, batch.candidates.clamp(min=0), liked)
+        share = args.soft_share * known.any(dim=-1, keepdim=True)
+        aim = (1.0 - share) * hard + share * soft
+    if args.label_smoothing:
+        legal = torch.ones_like(hard) if masks is None else masks.to(torch.float32)
+        aim = (1.0 - args.label_smoothing) * aim + args.label_smoothing * legal / legal.sum(dim=-1, keepdim=True)
+    return aim
+
+
+def cross_entropies(logits: Tensor, aim: Tensor, masks: Tensor | None) -> Tensor:
+    """- sum over actions of q log pi, [batch], of logits and q [batch, actions]."""
+    return -(aim * on_policy.legal_log_softmax(logits, masks)).sum(dim=-1)
+
+
+def huber(errors: Tensor, delta: float) -> Tensor:
+    """Half the square of errors up to ``delta``, beyond it delta (|e| - delta / 2); summed over dimensions, [batch]."""
+    return nn.functional.huber_loss(errors, torch.zeros_like(errors), reduction="none", delta=delta).sum(dim=-1)
+
+
+def deviation_losses(residuals: Tensor, log_stds: Tensor) -> Tensor:
+    """Negative log-likelihood of residuals [batch, dimensions] of a Gaussian, but for a constant, [batch]."""
+    return (0.5 * (residuals / log_stds.exp()).square() + log_stds).sum(dim=-1)
+
+
+class Said(NamedTuple):
+    """What a policy says of a batch."""
+
+    outputs: Tensor
+    """logits [batch, actions], or what is played of continuous actions [batch, dimensions]"""
+    unsquashed: Tensor | None = None
+    """continuous actions only: means of the Gaussian"""
+    log_stds: Tensor | None = None
+    """its log standard deviations, [dimensions] or [batch, dimensions]"""
+
+
+def said_by(network: nn.Module, observations: Tensor) -> Said:
+    """What any of the policies that are imitated with says of observations [batch, size]."""
+    if isinstance(network, ActorCritic):
+        outputs = network.actor(observations)
+        return Said(outputs, outputs, network.log_std) if network.continuous else Said(outputs)
+    if isinstance(network, GaussianActor):
+        means, log_stds = network(observations)
+        return Said(means.tanh(), means, log_stds)
+    assert isinstance(network, CategoricalActor)
+    return Said(network.network(observations))
+
+
+class Errors(NamedTuple):
+    """How far a policy is from its teacher, each [batch]."""
+
+    policy: Tensor
+    """what actions or means minimise"""
+    agrees: Tensor
+    """bool, the most probable action is the teacher's"""
+    deviations: Tensor | None = None
+    """what log standard deviations minimise"""
+
+
+_ALMOST_ONE = 0.999
+"""Where tanh is inverted: that of 1 would be infinite."""
+
+
+def errors_of(network: nn.Module, batch: Batch, args: Args) -> Errors:
+    """The losses of the policy (module docstring), and whether it agrees with the teacher."""
+    said = said_by(network, batch.observations)
+    if said.unsquashed is None:
+        assert batch.topology is not None
+        masks = batch.masks if args.mask_actions else None
+        losses = cross_entropies(said.outputs, aims(batch, masks, said.outputs.shape[-1], args), masks)
+        best = said.outputs if masks is None else said.outputs.masked_fill(~masks, on_policy.ILLEGAL_LOGIT)
+        return Errors(losses, best.argmax(dim=-1) == batch.topology)
+    return _continuous_errors(network, said, batch, args)
+
+
+def _continuous_errors(network: nn.Module, said: Said, batch: Batch, args: Args) -> Errors:
+    assert batch.injection is not None
+    assert said.unsquashed is not None
+    assert said.log_stds is not None
+    n = said.outputs.shape[-1] - batch.injection.shape[-1]
+    played = said.outputs.clamp(-1.0, 1.0)
+    losses = huber(said.outputs[:, n:] - batch.injection, args.huber_delta)
+    agrees = ((played[:, n:].detach() - batch.injection).abs() <= CLOSE).all(dim=-1)
+    aimed_at = batch.injection
+    if isinstance(network, GaussianActor):
+        aimed_at = aimed_at.clamp(-_ALMOST_ONE, _ALMOST_ONE).atanh()
+    residuals = aimed_at - said.unsquashed[:, n:].detach()
+    deviations = deviation_losses(residuals, said.log_stds[..., n:].clamp(*args.log_std_range))
+    if n:
+        assert batch.topology is not None
+        losses = losses + cross_entropies(args.joint_scale * played[:, :n], aims(batch, None, n, args), None)
+        losses = losses + (said.outputs[:, :n] - played[:, :n].detach()).square().sum(dim=-1)
+        deviations = deviations + (said.log_stds[..., :n] - gumbel_log_std(args)).square().mean(dim=-1)
+        agrees = agrees & (played[:, :n].argmax(dim=-1) == batch.topology)
+    return Errors(losses, agrees, deviations)
+
+
+def gumbel_log_std(args: Args) -> float:
+    """Log standard deviation of noise on the entries of a joint action that draws about as their logits say."""
+    return math.log(math.pi / (math.sqrt(6.0) * args.joint_scale))
+
+
+# --- Training -------------------------------------------------------------------------------------------------------
+
+
+class Imitation(Learner):
+    """One training run; see :class:`Learner`. It plays nothing."""
+
+    args: Args
+
+    def __init__(self, args: Args, envs: VectorEnv[Any, Any, Any]) -> None:
+        """Read the labels, set up the network and its optimiser.
+
+        Args:
+            args: Hyperparameters.
+            envs: What the labels are to be of; they are not reset.
+
+        Raises:
+            UsageError: the labels are not of these environments or cannot be read, or cannot be learned from with these
+                hyperparameters.
+        """
+        check_environments(args.algorithm, envs, num_envs=args.num_envs, mask_actions=args.mask_actions)
+        super().__init__(args, spec_of(envs))
+        description, labels = _labels_for(args, self.spec, getattr(envs.unwrapped, "options", None))
+        self._identity = {**description.identity, "teacher": description.teacher, "rounds": description.rounds}
+        self.network = self._policy().to(self.device)
+        self.optimizer = Adam(self._groups(), lr=args.actor_learning_rate, eps=1e-5)
+        self._take(labels, description)
+
+    def _policy(self) -> ActorCritic | GaussianActor | CategoricalActor:
+        args = self.args
+        if args.policy == SOFT:
+            return (GaussianActor if self.continuous else CategoricalActor)(self.networks, args.actor_layers)
+        network = ActorCritic(
+            self.networks,
+            actor_layers=args.actor_layers,
+            critic_layers=args.critic_layers,
+            initial_log_std=min(max(-1.0, args.log_std_range[0]), args.log_std_range[1]),
+        )
+        if self.spec.task is not None and find_task(self.spec.task).kind == "H":
+            with torch.no_grad():
+                network.log_std[: find_task(self.spec.task).n_topology_actions] = gumbel_log_std(args)
+        return network
+
+    def _groups(self) -> list[dict[str, Any]]:
+        """What is optimised: the policy, its deviations where they are no part of its layers, and the critic."""
+        if not isinstance(self.network, ActorCritic):
+            return [{"params": list(self.network.parameters())}]
+        deviations = [self.network.log_std] if self.continuous else []
+        parts = [list(self.network.actor.parameters()), deviations, list(self.network.critic.parameters())]
+        return [{"params": part} for part in parts if part]
+
+    def _take(self, labels: Labels, description: LabelsDescription) -> None:
+        """Part what is learned from and what is held out, and look at what both have in common."""
+        args = self.args
+        scenarios = [row.scenario for row in description.rows for _ in range(row.labels)]
+        out = held_out(scenarios, args.holdout)
+        aside = np.array([scenario in out for scenario in scenarios])
+        learned, kept = chosen_rows(labels, ~aside), chosen_rows(labels, aside)
+        if not len(learned):
+            raise UsageError("All labels are of months that are held out: set holdout to 0, or label more months.")
+        if self.normalizer is not None:
+            self.normalizer.load_state_dict(weighted_statistics(learned.observations, learned.weights))
+            self.normalizer.freeze()
+        acts = teacher_acts(learned)
+        factor = factor_of_acting(learned.weights, acts, args.acting_weight)
+        scale = float(np.mean(learned.weights * np.where(acts, factor, 1.0)))
+        self.acting_weight = factor
+        """How much more decisions count in which the teacher acts."""
+        self.examples = self._examples(learned, factor, scale)
+        """What is learned from."""
+        self.aside = self._examples(kept, factor, scale)
+        """What is held out."""
+        self._order = -1, np.zeros(0, np.int64)
+
+    def _examples(self, labels: Labels, factor: float, scale: float) -> Examples:
+        acts = teacher_acts(labels)
+        weights = (labels.weights * np.where(acts, factor, 1.0) / scale).astype(np.float32)
+        return Examples(labels, self.normalized(labels.observations), weights, acts, self.reward_scale)
+
+    def identity(self) -> dict[str, Any]:
+        """The labels: who decided them, and their hashes."""
+        return {"labels": self._identity}
+
+    def iterate(self) -> dict[str, float]:
+        """Learn from ``num_steps`` labels, and return the metrics."""
+        args = self.args
+        rates = self._set_learning_rates()
+        history: list[tuple[Errors, Batch, Tensor]] = []
+        for first in range(0, args.num_steps, args.batch_size):
+            batch = self.examples.rows(self._next(min(args.batch_size, args.num_steps - first)))
+            history.append(self._descend(batch))
+        self.iteration += 1
+        metrics = _metrics([(errors, batch) for errors, batch, _ in history], "losses/imitation_loss", "charts/")
+        if isinstance(self.network, ActorCritic):
+            metrics["losses/value_loss"] = mean(value for _, _, value in history)
+        metrics |= self._held_out_metrics()
+        metrics["charts/epochs"] = self.decisions / len(self.examples)
+        metrics["charts/learning_rate"] = rates[0]
+        if isinstance(self.network, ActorCritic) and self.continuous:
+            metrics["charts/action_std"] = float(self.network.log_std.detach().exp().mean())
+        return metrics
+
+    def _descend(self, batch: Batch) -> tuple[Errors, Batch, Tensor]:
+        errors = errors_of(self.network, batch, self.args)
+        losses = errors.policy if errors.deviations is None else errors.policy + errors.deviations
+        loss = (batch.weights * losses).mean()
+        value = torch.zeros(())
+        if isinstance(self.network, ActorCritic):
+            value = 0.5 * (batch.weights * (self.network.value(batch.observations) - batch.returns).square()).mean()
+            loss = loss + value.to(loss.device)
+        descend(self.optimizer, loss, self.args.max_grad_norm)
+        if isinstance(self.network, ActorCritic) and self.continuous:
+            with torch.no_grad():
+                self.network.log_std[-batch.injection.shape[-1] :].clamp_(*self.args.log_std_range)  # type: ignore[union-attr]
+        return Errors(errors.policy.detach(), errors.agrees), batch, value.detach()
+
+    def _held_out_metrics(self) -> dict[str, float]:
+        """How well the policy does on months that it does not learn from; nothing without such."""
+        if not len(self.aside):
+            return {}
+        with torch.no_grad():
+            batches = list(self.aside.batches(4096))
+            errors = [(errors_of(self.network, batch, self.args), batch) for batch in batches]
+            metrics = _metrics(errors, "losses/holdout_loss", "charts/holdout_")
+            if isinstance(self.network, ActorCritic):
+                values = torch.cat([self.network.value(batch.observations) for batch in batches])
+                returns = torch.cat([batch.returns for batch in batches])
+                metrics["losses/explained_variance"] = explained_variance(values, returns)
+        return metrics
+
+    def _set_learning_rates(self) -> tuple[float, float]:
+        """Let the step sizes follow their schedule; those of the policy and of the critic."""
+        remaining = 1.0 - self.iteration / self.num_iterations if self.args.anneal_learning_rate else 1.0
+        rates = (remaining * self.args.actor_learning_rate, remaining * self.args.critic_learning_rate)
+        groups = self.optimizer.param_groups
+        for group in groups:
+            group["lr"] = rates[0]
+        if isinstance(self.network, ActorCritic):
+            groups[-1]["lr"] = rates[1]
+        return rates
+
+    def _next(self, count: int) -> I64:
+        """Indices of the labels whose turn it is: every epoch has all of them, in an order of its own."""
+        parts: list[I64] = []
+        while count:
+            epoch, place = divmod(self.decisions, len(self.examples))
+            if self._order[0] != epoch:
+                drawn = Stream(self.args.seed, epoch, Purpose.AGENT).uniform(len(self.examples))
+                self._order = epoch, np.argsort(drawn, kind="stable")
+            part = self._order[1][place : place + count]
+            parts.append(part)
+            self.decisions += len(part)
+            count -= len(part)
+        return np.concatenate(parts)
+
+    def learned(self) -> Mapping[str, nn.Module | torch.optim.Optimizer]:
+        """See :class:`Learner`."""
+        return {"network": self.network, "optimizer": self.optimizer}
+
+    def policy(self) -> tuple[nn.Module, dict[str, Any]]:
+        """See :class:`Learner`."""
+        sizes: dict[str, Any] = {"policy": self.args.policy, "actor_layers": list(self.args.actor_layers)}
+        if self.args.policy == ON_POLICY:
+            sizes |= {"critic_layers": list(self.args.critic_layers), "n_costs": 0}
+        return self.network, sizes
+
+
+def _labels_for(args: Args, spec: Spec, options: Any) -> tuple[LabelsDescription, Labels]:
+    """The labels that are to be learned from, of environments with these options."""
+    if not args.labels:
+        raise UsageError("Imitation needs labels: give a folder that 'rl2grid teach' wrote, with --labels.")
+    if spec.task is None:
+        raise UsageError("Imitation learns tasks of rl2grid, whose observations and actions labels can name.")
+    description, labels = read_labels([Path(folder) for folder in args.labels], spec.task)
+    for name in ("heuristic", "normalize", "reward"):
+        mine, theirs = getattr(options, name), description.env_keywords.get(name)
+        if mine != theirs:
+            raise UsageError(f"The labels are of environments with {name}={theirs}, not {mine}: train with the former.")
+    if args.gamma != description.gamma:
+        raise UsageError(
+            f"The returns of the labels are discounted by gamma={description.gamma}, not {args.gamma}: set gamma to "
+            "the former."
+        )
+    return description, labels
+
+
+def weighted_statistics(observations: F32, weights: F32) -> dict[str, Any]:
+    """State of an :class:`~rl2grid.envs.normalization.ObservationNormalizer` that saw each of them so many times."""
+    total = float(weights.sum(dtype=np.float64))
+    average = np.zeros(observations.shape[1])
+    squares = np.zeros(observations.shape[1])
+    for first in range(0, len(weights), 4096):  # in float64, a part at a time
+        part = slice(first, first + 4096)
+        average += weights[part].astype(np.float64) @ observations[part].astype(np.float64) / total
+    for first in range(0, len(weights), 4096):
+        part = slice(first, first + 4096)
+        squares += weights[part].astype(np.float64) @ np.square(observations[part] - average)
+    count = max(round(total), 1)
+    return {"count": count, "mean": average, "squares": squares * (count / total)}
+
+
+def _metrics(seen: Sequence[tuple[Errors, Batch]], loss: str, agreement: str) -> dict[str, float]:
+    """Means over decisions: the loss as it is minimised, and how often the most probable action is the teacher's."""
+    losses = torch.cat([batch.weights * errors.policy for errors, batch in seen])
+    agrees = torch.cat([errors.agrees for errors, _ in seen])
+    acts = torch.cat([batch.acts for _, batch in seen])
+    counts = torch.cat([batch.stands_for for _, batch in seen])
+    metrics = {loss: float(losses.mean()), f"{agreement}agreement": float((counts * agrees).sum() / counts.sum())}
+    if acts.any():
+        metrics[f"{agreement}agreement_acting"] = float((counts * agrees)[acts].sum() / counts[acts].sum())
+    return metrics
+
+
+def load_policy(state: Mapping[str, Any]) -> ActorCritic | GaussianActor | CategoricalActor:
+    """The network of a checkpoint's section ``policy``."""
+    return sac.load_policy(state) if state["policy"] == SOFT else on_policy.load_policy(state)
+
+
+ALGORITHM = Algorithm("imitation", Args, Imitation, ("T", "R"), preset, load_policy, SEARCH_SPACE, joint_as_box=True)
