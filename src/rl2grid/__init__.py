@@ -151,7 +151,8 @@ def load(run: str | Path, *, deterministic: bool = True) -> PolicyAgent:
     """The policy of a training run, or of one checkpoint file, as an agent; nothing in the file is executed.
 
     Args:
-        run: A run folder (its best policy by validation, else its latest), or a checkpoint file.
+        run: A run folder (its best policy by validation, else its latest), a checkpoint file, or a policy that comes
+            with the package, such as ``"pretrained/bus14-T0"`` (``rl2grid pretrained`` lists them).
         deterministic: Whether to play the most probable action instead of a sample.
 
     Raises:

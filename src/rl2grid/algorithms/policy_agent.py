@@ -15,6 +15,7 @@ import torch
 
 from rl2grid.agents.agent import Action, Considered, Info, Observation
 from rl2grid.algorithms.checkpoint import load_checkpoint
+from rl2grid.algorithms.pretrained import is_pretrained, pretrained
 from rl2grid.algorithms.registry import find_algorithm
 from rl2grid.envs.joint import JointAsBox, JointAsDiscrete
 from rl2grid.envs.normalization import ObservationNormalizer
@@ -176,7 +177,7 @@ def load_agent(
     """The policy of a checkpoint, or of a run folder (its best by validation, else its latest).
 
     Args:
-        path: A checkpoint file or a run folder.
+        path: A checkpoint file, a run folder, or ``pretrained/<name>``, see :mod:`rl2grid.algorithms.pretrained`.
         task: The task that it is to play, or its id; None: the one it was trained on.
         deterministic: Whether to play the most probable action instead of a sample (DQN and TD3 have no others).
         name: What tables call the agent; by default the name of the algorithm.
@@ -184,6 +185,9 @@ def load_agent(
     Raises:
         UsageError: no checkpoint there, or one of another task or another version of rl2grid.
     """
+    if is_pretrained(path):
+        card = pretrained(path)
+        path, name = card.file, name or f"pretrained-{card.name}"
     path = Path(path)
     if path.is_dir():
         best = path / BEST_FILE

@@ -11,6 +11,7 @@ from typing import Any
 
 from rl2grid.agents.agent import Agent
 from rl2grid.agents.planner import Planner
+from rl2grid.algorithms.pretrained import is_pretrained
 from rl2grid.analysis.comparison_table import reference_table
 from rl2grid.analysis.summary_table import summary_table
 from rl2grid.analysis.table import table_records
@@ -170,6 +171,8 @@ def _default_output(
 
 def _in_paths(agent: str, made: Agent) -> str:
     """What folders call an agent; one of a user's own gets another folder whenever its file has changed."""
+    if is_pretrained(agent):
+        return made.name
     if not is_own(agent):
         return agent
     name = re.sub(r"[^\w.+-]+", "-", made.name)

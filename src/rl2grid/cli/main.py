@@ -28,6 +28,7 @@ COMMANDS: dict[str, str] = {
     "demo": "train DQN on bus14, evaluate it beside simple agents, write a report",
     "tasks": "list the tasks (103 of the paper and 96 joint ones) and their sizes",
     "train": "train an algorithm on a task",
+    "pretrained": "list the policies that come with the package, and how each was made",
     "evaluate": "play agents on enumerated scenarios, one row per episode",
     "rank": "rank a grid's topology actions by trying them",
     "analyse": "tables and figures from evaluations and training runs",

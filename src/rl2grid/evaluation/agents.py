@@ -14,6 +14,7 @@ from rl2grid.agents.milp import Milp
 from rl2grid.agents.planner import Planner
 from rl2grid.agents.random_agent import RandomAgent
 from rl2grid.agents.recovery import Recovery
+from rl2grid.algorithms.pretrained import is_pretrained
 from rl2grid.envs.tasks import Task
 from rl2grid.errors import UsageError, one_of
 from rl2grid.evaluation.own_agents import is_own, load_own_agent
@@ -58,8 +59,14 @@ def make_agent(spec: str | Path, task: Task | None = None, *, top_k: int | None 
     if is_own(str(spec)):
         return load_own_agent(str(spec))
     path = Path(spec)
-    if not path.exists():
-        others = ("the path of a checkpoint", "the path of a run folder", "package.module:Agent", "./agent.py")
+    if not path.exists() and not is_pretrained(spec):
+        others = (
+            "the path of a checkpoint",
+            "the path of a run folder",
+            "pretrained/NAME",
+            "package.module:Agent",
+            "./agent.py",
+        )
         raise one_of("Agent", str(spec), (*AGENTS, *others))
     # Imported here: agents without training run without torch.
     from rl2grid.algorithms.policy_agent import load_agent

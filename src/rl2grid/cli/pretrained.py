@@ -1,0 +1,70 @@
+"""``rl2grid pretrained``: the policies that come with the package, and their cards."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+from typing import Any
+
+from rl2grid.algorithms.pretrained import PREFIX, ModelCard, cards, pretrained
+from rl2grid.analysis.table import Cell, Column, ResultTable
+from rl2grid.cli.output import Output
+
+_COLUMNS = (
+    Column("policy", words=True),
+    Column("task", words=True),
+    Column("heuristic", words=True),
+    Column("made by", words=True),
+    Column("survival"),
+    Column("months"),
+    Column("kB"),
+)
+
+
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of the command."""
+    parser.add_argument("policy", nargs="?", default=None, help="one of them, to read its card")
+    parser.set_defaults(run=_run)
+
+
+def _run(options: argparse.Namespace, output: Output) -> int:
+    if options.policy is not None:
+        return _tell(pretrained(options.policy), output)
+    every = cards()
+    rows = tuple(tuple(Cell(text) for text in _cells(card)) for card in every)
+    table = ResultTable("pretrained", "", _COLUMNS, rows)
+    output.table(table, [_record(card) for card in every], title="Survival on validation months")
+    output.remark("Play one: `rl2grid watch pretrained/NAME TASK`. How it was made: `rl2grid pretrained NAME`.")
+    return 0
+
+
+def _tell(card: ModelCard, output: Output) -> int:
+    output.results(**_record(card))
+    output.text(f"{PREFIX}{card.name}: {card.algorithm} on {card.task}, network {card.network}.")
+    output.text(f"Heuristic: {card.heuristic or 'none'}. Weights: {card.policy_hash}, {_size(card)} kB.")
+    output.text("On validation months that nothing was chosen by:")
+    for each in card.validation:
+        output.text(
+            f"  {each.agent}: survival {each.survival:.3f} [{each.low:.3f}, {each.high:.3f}], "
+            f"{each.completed:.0%} completed, {each.months} months"
+        )
+    output.text("Made by:")
+    for command in card.commands:
+        output.text(f"  {command}")
+    output.text(f"Limits: {card.limits}")
+    return 0
+
+
+def _record(card: ModelCard) -> dict[str, Any]:
+    return asdict(card) | {"name": PREFIX + card.name, "kilobytes": _size(card)}
+
+
+def _cells(card: ModelCard) -> tuple[str, ...]:
+    own = card.validation[0]
+    survival = f"{own.survival:.3f} [{own.low:.3f}, {own.high:.3f}]"
+    heuristic = card.heuristic or "none"
+    return (PREFIX + card.name, card.task, heuristic, card.algorithm, survival, str(own.months), str(_size(card)))
+
+
+def _size(card: ModelCard) -> int:
+    return round(card.file.stat().st_size / 1000)
