@@ -80,6 +80,26 @@ class ExplainingAgent(Protocol):
         """What the last ``act`` thought of; None: there was nothing to choose."""
 
 
+@runtime_checkable
+class RankingAgent(Protocol):
+    """An agent that compares single topology actions; who learns from it is told what it thought of them."""
+
+    def ranking(self, most: int) -> Considered | None:
+        """The topology actions, by id, that the last ``act`` found best; None: it compared none.
+
+        Args:
+            most: how many of them are asked for.
+        """
+
+
+@runtime_checkable
+class OverruledAgent(Protocol):
+    """An agent that remembers what it plays, and can be told that another action was played in its place."""
+
+    def overruled(self, played: Action) -> None:
+        """Not the last ``act`` was played but this; the next one is asked for what follows from there."""
+
+
 def no_intervention(space: gymnasium.Space[Any]) -> Action:
     """The action that changes nothing: id 0 of a topology task, zeros of a redispatching task, both of a joint task."""
     if isinstance(space, gymnasium.spaces.Dict):
@@ -111,6 +131,11 @@ def has_topology_actions(space: gymnasium.Space[Any]) -> bool:
 def has_injections(space: gymnasium.Space[Any]) -> bool:
     """Whether actions of ``space`` are continuous, or have such a part."""
     return isinstance(space, gymnasium.spaces.Box | gymnasium.spaces.Dict)
+
+
+def topology_part(action: Action) -> int:
+    """The topology action in an action of a topology task or of a joint one."""
+    return int(action[TOPOLOGY] if isinstance(action, Mapping) else action)
 
 
 def topology_action(space: gymnasium.Space[Any], chosen: int) -> Action:

@@ -7,7 +7,7 @@ from typing import Any
 
 import gymnasium
 
-from rl2grid.agents.agent import Action, Agent, Considered, ExplainingAgent, Info, Observation
+from rl2grid.agents.agent import Action, Agent, Considered, ExplainingAgent, Info, Observation, RankingAgent
 from rl2grid.agents.greedy_dispatch import GreedyDispatch
 from rl2grid.agents.greedy_joint import GreedyJoint
 from rl2grid.agents.greedy_topology import GreedyTopology
@@ -49,6 +49,10 @@ class Greedy:
     def explain(self) -> Considered | None:
         """What was tried and by what rule the action was chosen."""
         return self._search.explain() if isinstance(self._search, ExplainingAgent) else None
+
+    def ranking(self, most: int) -> Considered | None:
+        """The topology actions with the least worst loading by the forecast; None: it compared none."""
+        return self._search.ranking(most) if isinstance(self._search, RankingAgent) else None
 
     def _search_of(self, space: gymnasium.Space[Any]) -> Agent:
         if isinstance(space, gymnasium.spaces.Discrete):

@@ -62,5 +62,9 @@ class GreedyJoint:
         """What was tried and by what rule the action was chosen."""
         return (None if self._alone else self._dispatch.explain()) or self._topology.explain()
 
+    def ranking(self, most: int) -> Considered | None:
+        """The topology actions with the least worst loading by the forecast, nothing being dispatched."""
+        return self._topology.ranking(most)
+
     def _is_enough(self, chosen: int) -> bool:
         return bool(worst_loading(self._env, topology_action(self._space, chosen)) < SAFE_RHO)

@@ -73,11 +73,13 @@ class GreedyTopology:
 
     def choose(self) -> int:
         """The id of the best action; 0 where none is better than doing nothing."""
+        self._loading: F64 | None = None
         if is_safe(self._env.state, 0):
             self._why = "while the grid is safe, it does what recovery does, if the forecast then stays safe"
             return self._recover()
         outcomes = self._env.what_if(self._ids)
         loading = np.where(outcomes.legal, outcomes.worst_loading, np.inf).astype(np.float64)
+        self._loading = loading
         if not loading.min() < loading[_NOTHING] - _WORTHWHILE:
             self._why = "by the forecast, no action is better than doing nothing"
             return _NOTHING
@@ -86,6 +88,14 @@ class GreedyTopology:
     def explain(self) -> Considered | None:
         """By what rule the last action was chosen; what was compared is what every action promises."""
         return Considered("", (), (), self._why)
+
+    def ranking(self, most: int) -> Considered | None:
+        """The actions with the least worst loading by the forecast; None: the grid was safe."""
+        if self._loading is None:
+            return None
+        best = np.argsort(self._loading, kind="stable")[:most]
+        best = best[np.isfinite(self._loading[best])]
+        return Considered("worst loading", [self._ids[k] for k in best.tolist()], self._loading[best].tolist())
 
     def _best(self, loading: F64) -> int:
         """The entry to play, given the worst loading after each: one of them is better than do nothing."""

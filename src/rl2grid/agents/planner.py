@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from rl2grid.agents.agent import Action, Considered, Info, Observation, injecting_action
+from rl2grid.agents.agent import Action, Considered, Info, Observation, injecting_action, topology_part
 from rl2grid.agents.contingencies import NONE, Contingencies, danger, expected
 from rl2grid.agents.dispatch import controls, encode, worst_loading
 from rl2grid.agents.greedy_topology import effects
@@ -118,16 +118,23 @@ class Planner:
         self._why = ""
         self._planned: F64 | None = None
         self._age = 0
+        self._compared: list[tuple[int, float]] = []
+        self._topology, self._is_plan_void = NOTHING, False
         if self._dispatch is not None:
             self._dispatch.reset()
 
     def act(self, observation: Observation, info: Info) -> Action:
         """What it plans for the next step."""
         state: GridState = self._env.state
-        self._why = ""
+        self._why, self._compared = "", []
         if self._dispatch is not None:
             self._dispatch.watch(state)
-        moment = self._moment(state)
+        action = self._choose(self._moment(state))
+        if self._search is not None:
+            self._topology = topology_part(action)
+        return action
+
+    def _choose(self, moment: _Moment) -> Action:
         if moment.safe and self._is_calm(moment):
             topology = self._restoring(moment)
             injection = self._preventive(moment, topology) if self._dispatch is not None else None
@@ -137,6 +144,20 @@ class Planner:
     def explain(self) -> Considered | None:
         """By what rule the last action was chosen."""
         return Considered("", (), (), self._why) if self._why else None
+
+    def ranking(self, most: int) -> Considered | None:
+        """The single topology actions that the search found best, with the worst loading by the forecast, and more
+        where several lines are overloaded or one would trip; None: there was no search.
+        """
+        if not self._compared:
+            return None
+        actions, penalties = zip(*self._compared[:most], strict=True)
+        return Considered("worst loading and overloads", actions, penalties)
+
+    def overruled(self, played: Action) -> None:
+        """Another topology than the one it was made for voids a plan: the next one is made at once."""
+        if self._search is not None:
+            self._is_plan_void |= topology_part(played) != self._topology
 
     def _moment(self, state: GridState) -> _Moment:
         return _Moment(state, is_safe(state, 0), forecast_of(self._env.engine, 0))
@@ -188,10 +209,10 @@ class Planner:
         assert self._dispatch is not None
         state = moment.state
         due = int(state.step[0]) % _PERIOD == 0 or topology != NOTHING
-        due = due or np.abs(state.storage_power[0]).max(initial=0.0) > _STORING
+        due = due or np.abs(state.storage_power[0]).max(initial=0.0) > _STORING or self._is_plan_void
         self._age += 1
         if due or (self._age >= _LEAST_AGE and self._drifts(state)):
-            self._age = 0
+            self._age, self._is_plan_void = 0, False
             point = snapshot_of(self._env.engine, 0)
             self._planned = self._plan(moment, point, topology, self._series(state), _PERIOD)
         return None if self._planned is None else self._towards(topology, self._planned)
@@ -219,7 +240,7 @@ class Planner:
         topology = NOTHING
         if moment.ahead is not None:
             found = self._search.best(moment.ahead, moment.state.timestep_overflow[0], self._feared(moment))
-            topology = found.action
+            topology, self._compared = found.action, self._search.singles
             self._why = (
                 f"{found.n_actions} actions lead to a worst loading of {found.worst_loading:.0%}"
                 f"{f', with {found.n_trips} lines tripped' if found.n_trips else ''}"

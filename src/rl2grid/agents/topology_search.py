@@ -105,6 +105,9 @@ class TopologySearch:
         self._grid, self._catalogue, self._what_if = grid, catalogue, what_if
         self._longest, self._seconds = longest, seconds
         self._actions: dict[int, StepAction] = {}
+        self.singles: list[tuple[int, float]] = []
+        """Of the last search: entries of the catalogue that are best as the only action, and their penalty, which is
+        the worst loading and more where several lines are overloaded or one would trip; the best first."""
 
     def best(self, point: Snapshot, overflow: I32, contingencies: Contingencies) -> Found:
         """The first action of the best sequence.
@@ -117,9 +120,11 @@ class TopologySearch:
         until = np.inf if self._seconds is None else time.perf_counter() + self._seconds
         ways = [_Way(-1, point, overflow.astype(np.int32), 0, np.inf, 0.0)]
         entries: I32 | None = None
-        best = _LOST
+        best, self.singles = _LOST, []
         for depth in range(self._depth(overflow)):
             steps = self._steps(ways, entries, _BEAM[min(depth, len(_BEAM) - 1)], until)
+            if depth == 0:
+                self.singles = [(step.action, step.score) for step in steps]
             if not steps:
                 break
             safe = [step for step in steps if not step.trips and step.way.n_trips == 0 and step.worst < SAFE]
