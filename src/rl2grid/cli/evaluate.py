@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -11,7 +10,6 @@ from typing import Any
 
 from rl2grid.agents.agent import Agent
 from rl2grid.agents.planner import Planner
-from rl2grid.algorithms.pretrained import is_pretrained
 from rl2grid.analysis.comparison_table import reference_table
 from rl2grid.analysis.summary_table import summary_table
 from rl2grid.analysis.table import table_records
@@ -22,7 +20,7 @@ from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import make_agent
 from rl2grid.evaluation.flags import environment_flags, evaluate_command
-from rl2grid.evaluation.own_agents import is_own
+from rl2grid.evaluation.places import default_folder
 from rl2grid.evaluation.protocol import evaluate, first_months
 from rl2grid.records.collection import LAST_POLICY
 from rl2grid.records.evaluations import Evaluation
@@ -152,7 +150,6 @@ def _compare(results: Sequence[Evaluation], output: Output) -> None:
 def _default_output(
     agent: str, made: Agent, options: argparse.Namespace, task: Task, chosen: Mapping[str, Any]
 ) -> Path:
-    """Inside the run for one of its policies; else by task and agent."""
     parts = [options.split]
     if "heuristic" in chosen:
         parts.append(str(chosen["heuristic"]))
@@ -160,22 +157,4 @@ def _default_output(
         parts.append(f"{options.months}-months")
     parts += [f"{value}-{name}" for name, value in _own_flags(options).items()]
     parts += [flag.removeprefix("--") for flag in environment_flags({**chosen, "heuristic": None})]
-    name = "-".join(parts)
-    path = Path(agent)
-    if path.is_dir():
-        return path / "evaluation" / name
-    if path.is_file() and not is_own(agent):
-        return path.parent / "evaluation" / f"{path.stem}-{name}"
-    return Path("runs") / f"{task.id.removeprefix('rl2grid/')}-{_in_paths(agent, made)}" / "evaluation" / name
-
-
-def _in_paths(agent: str, made: Agent) -> str:
-    """What folders call an agent; one of a user's own gets another folder whenever its file has changed."""
-    if is_pretrained(agent):
-        return made.name
-    if not is_own(agent):
-        return agent
-    name = re.sub(r"[^\w.+-]+", "-", made.name)
-    version = getattr(made, "identity", None)
-    source = version.get("source_hash", "") if isinstance(version, dict) else ""
-    return f"{name}-{source[:8]}" if source else name
+    return default_folder(agent, made, task, "evaluation", "-".join(parts))

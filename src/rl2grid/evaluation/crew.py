@@ -1,4 +1,7 @@
-"""Who plays the episodes of an evaluation: this process, or several worker processes.
+"""Who plays many episodes, those of an evaluation for one: this process, or several worker processes.
+
+What is done with an episode is the part of a :class:`Player`, which every process makes of a copy of the same
+:class:`Setup`.
 
 A worker is a Python process that runs :func:`main`: it inherits no threads and does not import the
 caller's script again. Messages are pickles on its standard input and output; it ends when its input does.
@@ -17,14 +20,14 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import TracebackType
-from typing import Any, BinaryIO, NamedTuple, Protocol, Self
+from typing import Any, BinaryIO, Generic, NamedTuple, Protocol, Self, TypeVar
 
 import gymnasium
 
 from rl2grid.agents.agent import Action, Agent, Info
 from rl2grid.envs.registration import own_systems, register_all, register_system
 from rl2grid.errors import UsageError
-from rl2grid.evaluation.episode import play_episode
+from rl2grid.evaluation.episode import OnTransition, play_episode
 from rl2grid.processes import kill, take_standard_streams
 from rl2grid.records.episodes import Episode
 
@@ -39,15 +42,8 @@ _ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM
 """Workers are the parallelism: threads of theirs would only compete."""
 
 
-@dataclass(frozen=True)
-class Setting:
-    """What all episodes of an evaluation have in common."""
-
-    task: str
-    agent: Agent
-    """Not bound yet; workers play copies of it."""
-    env_keywords: Mapping[str, Any] = field(default_factory=dict)
-    """Keywords of ``gymnasium.make``."""
+Result = TypeVar("Result")
+Told = TypeVar("Told", covariant=True)
 
 
 class Job(NamedTuple):
@@ -55,7 +51,8 @@ class Job(NamedTuple):
 
     scenario: str
     seed: int
-    start: int
+    start: int | None
+    """Row of the scenario at which it begins; None: drawn in training, else 0."""
 
 
 class Progress(NamedTuple):
@@ -70,10 +67,46 @@ class Progress(NamedTuple):
 OnProgress = Callable[[Progress], None]
 
 
-class Crew(Protocol):
+class Player(Protocol[Told]):
+    """Plays one episode after the other, and tells what is to be known of each."""
+
+    def play(self, job: Job, on_progress: OnProgress) -> Told:
+        """Play an episode."""
+
+    def close(self) -> None:
+        """Free what it plays with."""
+
+
+class Setup(Protocol[Told]):
+    """What all episodes have in common; it can be pickled."""
+
+    def player(self) -> Player[Told]:
+        """Who plays them in this process.
+
+        Raises:
+            UsageError: the environment or the agent cannot be made, or do not fit.
+        """
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What all episodes of an evaluation have in common."""
+
+    task: str
+    agent: Agent
+    """Not bound yet; workers play copies of it."""
+    env_keywords: Mapping[str, Any] = field(default_factory=dict)
+    """Keywords of ``gymnasium.make``."""
+
+    def player(self) -> BoundAgent:
+        """The agent, bound to an environment."""
+        return BoundAgent(self)
+
+
+class Crew(Protocol[Told]):
     """Plays episodes and tells of them as they go."""
 
-    def play(self, jobs: Sequence[Job], on_progress: OnProgress) -> Iterator[Episode]:
+    def play(self, jobs: Sequence[Job], on_progress: OnProgress) -> Iterator[tuple[Job, Told]]:
         """Play all jobs, in no particular order; ``on_progress`` is told of running ones at most twice a second.
 
         Raises:
@@ -88,9 +121,9 @@ class Crew(Protocol):
     ) -> None: ...
 
 
-def make_crew(setting: Setting, workers: int) -> Crew:
+def make_crew(setup: Setup[Result], workers: int) -> Crew[Result]:
     """``workers`` processes, or this one if there are to be none."""
-    return WorkerCrew(setting, workers) if workers else LocalCrew(setting)
+    return WorkerCrew(setup, workers) if workers else LocalCrew(setup)
 
 
 class BoundAgent:
@@ -106,8 +139,8 @@ class BoundAgent:
             self._env.close()
             raise
 
-    def play(self, job: Job, on_progress: OnProgress) -> Episode:
-        """Play an episode."""
+    def play(self, job: Job, on_progress: OnProgress, on_transition: OnTransition | None = None) -> Episode:
+        """Play an episode; ``on_transition`` is told what came of every action."""
         told = time.monotonic()
 
         def tell(action: Action, info: Info) -> None:
@@ -117,7 +150,13 @@ class BoundAgent:
                 on_progress(Progress(job, int(info["step"]), int(info["episode_length"])))
 
         return play_episode(
-            self._agent, self._env, scenario=job.scenario, seed=job.seed, start=job.start, on_decision=tell
+            self._agent,
+            self._env,
+            scenario=job.scenario,
+            seed=job.seed,
+            start=job.start,
+            on_decision=tell,
+            on_transition=on_transition,
         )
 
     def close(self) -> None:
@@ -125,41 +164,41 @@ class BoundAgent:
         self._env.close()
 
 
-class LocalCrew:
+class LocalCrew(Generic[Result]):
     """Plays in this process, one episode after the other."""
 
-    def __init__(self, setting: Setting) -> None:
-        self._setting = setting
-        self._agent: BoundAgent | None = None
+    def __init__(self, setup: Setup[Result]) -> None:
+        self._setup = setup
+        self._player: Player[Result] | None = None
 
-    def play(self, jobs: Sequence[Job], on_progress: OnProgress) -> Iterator[Episode]:
+    def play(self, jobs: Sequence[Job], on_progress: OnProgress) -> Iterator[tuple[Job, Result]]:
         """See :class:`Crew`."""
-        self._agent = BoundAgent(self._setting)
+        self._player = self._setup.player()
         for job in jobs:
-            yield self._agent.play(job, on_progress)
+            yield job, self._player.play(job, on_progress)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._agent is not None:
-            self._agent.close()
+        if self._player is not None:
+            self._player.close()
 
 
-class WorkerCrew:
-    """Plays in worker processes, each with an environment of its own."""
+class WorkerCrew(Generic[Result]):
+    """Plays in worker processes, each with a player of its own."""
 
-    def __init__(self, setting: Setting, workers: int) -> None:
-        self._setting, self._workers = setting, workers
+    def __init__(self, setup: Setup[Result], workers: int) -> None:
+        self._setup, self._workers = setup, workers
         self._answers: queue.SimpleQueue[tuple[_Worker, str, Any]] = queue.SimpleQueue()
         self._running: list[_Worker] = []
 
-    def play(self, jobs: Sequence[Job], on_progress: OnProgress) -> Iterator[Episode]:
+    def play(self, jobs: Sequence[Job], on_progress: OnProgress) -> Iterator[tuple[Job, Result]]:
         """See :class:`Crew`."""
         waiting = list(reversed(jobs))
         open_jobs = len(waiting)
         for _ in range(min(self._workers, open_jobs)):
-            worker = _Worker(self._setting, self._answers)
+            worker = _Worker(self._setup, self._answers)
             self._running.append(worker)
             worker.send(waiting.pop())
         while open_jobs:
@@ -174,9 +213,11 @@ class WorkerCrew:
                 on_progress(value)
                 continue
             open_jobs -= 1
+            job = worker.job
+            assert job is not None
             if waiting:
                 worker.send(waiting.pop())
-            yield value
+            yield job, value
 
     def __enter__(self) -> Self:
         return self
@@ -197,7 +238,7 @@ class WorkerCrew:
 class _Worker:
     """A worker process, and the thread that collects its answers."""
 
-    def __init__(self, setting: Setting, answers: queue.SimpleQueue[tuple[_Worker, str, Any]]) -> None:
+    def __init__(self, setup: Setup[Any], answers: queue.SimpleQueue[tuple[_Worker, str, Any]]) -> None:
         self.job: Job | None = None
         """What it plays."""
         self._answers = answers
@@ -211,7 +252,7 @@ class _Worker:
         self._thread.start()
         self._send(sys.path)
         self._send(own_systems())
-        self._send(setting)
+        self._send(setup)
 
     def send(self, job: Job) -> None:
         """Ask for an episode."""
@@ -253,14 +294,14 @@ def serve(requests: BinaryIO, answers: BinaryIO) -> None:
         sys.path += [folder for folder in pickle.load(requests) if folder not in sys.path]
         for system in pickle.load(requests):
             register_system(system)
-        bound = BoundAgent(pickle.load(requests))
+        player = pickle.load(requests).player()
         while True:
             try:
                 job = pickle.load(requests)
             except EOFError:
                 break
-            answer("played", bound.play(job, lambda progress: answer("progress", progress)))
-        bound.close()
+            answer("played", player.play(job, lambda progress: answer("progress", progress)))
+        player.close()
     except UsageError as error:
         answer("refused", str(error))
     except BrokenPipeError:

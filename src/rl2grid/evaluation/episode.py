@@ -19,6 +19,9 @@ from rl2grid.records.episodes import Episode
 
 OnDecision = Callable[[Action, Info], None]
 """Called with every action of the agent and the ``info`` on which it was chosen."""
+OnTransition = Callable[[bool, bool, Info], None]
+"""Called with what came of every action of the agent: whether the episode was lost, whether it was completed, and the
+``info`` after it."""
 
 
 def play_episode(
@@ -27,8 +30,9 @@ def play_episode(
     *,
     scenario: str,
     seed: int,
-    start: int = 0,
+    start: int | None = 0,
     on_decision: OnDecision | None = None,
+    on_transition: OnTransition | None = None,
 ) -> Episode:
     """Play one episode with an agent that is bound to ``env``.
 
@@ -41,8 +45,9 @@ def play_episode(
         env: made by ``gymnasium.make``.
         scenario: id of the scenario.
         seed: of maintenance, opponent and agent, together with the scenario; see :func:`environment_seed`.
-        start: row at which the episode begins.
+        start: row at which the episode begins; None: drawn in training, else 0.
         on_decision: called at every decision.
+        on_transition: called after the transition of every decision.
 
     Returns:
         What happened, without the labels of an evaluation.
@@ -67,9 +72,8 @@ def play_episode(
         # The agent is only asked where the heuristic is not at ease, so that a game over in a later step of the
         # transition, or inside the reset, comes from a state without overloads.
         decided, overloads = info["step"], overloaded_lines(state, 0)
-        if info["over"]:
-            action = no_intervention(env.action_space)
-        else:
+        asked = not info["over"]
+        if asked:
             action = agent.act(observation, info)
             decisions += 1
             if played.imagined:
@@ -78,8 +82,12 @@ def play_episode(
                 )
             if on_decision is not None:
                 on_decision(action, info)
+        else:
+            action = no_intervention(env.action_space)
         observation, reward, terminated, truncated, info = env.step(action)
         over = terminated or truncated
+        if asked and on_transition is not None:
+            on_transition(bool(terminated), bool(truncated), info)
         _add(totals, float(reward), info["reward_components"], info["costs"])
         illegal += int(info["illegal"])
         ambiguous += int(info["ambiguous"])
@@ -87,7 +95,7 @@ def play_episode(
     return Episode(
         scenario=scenario,
         seed=seed,
-        start=start,
+        start=int(info["start"]),
         episode_length=int(info["episode_length"]),
         grid_steps=int(info["step"]),
         decisions=decisions,
@@ -126,6 +134,6 @@ def _add(totals: dict[str, Any], reward: float, components: dict[str, float], co
         totals[constraint.column] += costs[name]
 
 
-def _episode_number(scenario: str, start: int) -> int:
+def _episode_number(scenario: str, start: int | None) -> int:
     """A number for the agent's random stream: scenarios of one seed are to be played differently."""
     return zlib.crc32(f"{scenario}@{start}".encode())

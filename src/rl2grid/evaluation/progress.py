@@ -1,4 +1,4 @@
-"""What an evaluation shows of its course."""
+"""What is shown of the course of many episodes."""
 
 from __future__ import annotations
 
@@ -10,13 +10,12 @@ import rich.progress
 from rich.console import Console
 from rich.markup import escape
 
-from rl2grid.evaluation.crew import Job, Progress, Setting
-from rl2grid.records.episodes import Episode
+from rl2grid.evaluation.crew import Job, Progress
 from rl2grid.records.files import printable
 
 
 class Display:
-    """Tells of the course of an evaluation; this one keeps silent."""
+    """Tells of the course of many episodes; this one keeps silent."""
 
     def skip(self, jobs: Iterable[Job]) -> None:
         """These were played in an earlier call."""
@@ -24,23 +23,21 @@ class Display:
     def advance(self, progress: Progress) -> None:
         """An episode is under way."""
 
-    def finish(self, episode: Episode) -> None:
-        """An episode ended."""
+    def finish(self, job: Job, grid_steps: int) -> None:
+        """An episode ended after so many steps."""
 
 
 class ProgressBar(Display):
     """Episodes done, grid steps per second, remaining time."""
 
-    def __init__(self, bar: rich.progress.Progress, setting: Setting, n_jobs: int) -> None:
+    def __init__(self, bar: rich.progress.Progress, words: str, n_jobs: int) -> None:
         self._bar = bar
         self._began = time.monotonic()
         self._shares: dict[Job, float] = {}
         self._steps: dict[Job, int] = {}
         self._finished = 0
         self._n_jobs = n_jobs
-        self._id = bar.add_task(
-            f"Evaluating {escape(printable(setting.agent.name))}", total=n_jobs, rate="", count=f"0/{n_jobs}"
-        )
+        self._id = bar.add_task(escape(printable(words)), total=n_jobs, rate="", count=f"0/{n_jobs}")
 
     def skip(self, jobs: Iterable[Job]) -> None:
         self._shares |= dict.fromkeys(jobs, 1.0)
@@ -52,9 +49,8 @@ class ProgressBar(Display):
         self._steps[progress.job] = progress.grid_steps
         self._show()
 
-    def finish(self, episode: Episode) -> None:
-        job = Job(episode.scenario, episode.seed, episode.start)
-        self._shares[job], self._steps[job] = 1.0, episode.grid_steps
+    def finish(self, job: Job, grid_steps: int) -> None:
+        self._shares[job], self._steps[job] = 1.0, grid_steps
         self._finished += 1
         self._show()
 
@@ -69,8 +65,14 @@ class ProgressBar(Display):
 
 
 @contextmanager
-def show_progress(setting: Setting, jobs: Sequence[Job], progress: bool) -> Iterator[Display]:
-    """What to tell of the course of an evaluation, with a bar or without."""
+def show_progress(words: str, jobs: Sequence[Job], progress: bool) -> Iterator[Display]:
+    """What to tell of the course of many episodes, with a bar or without.
+
+    Args:
+        words: what is done, as "Evaluating greedy".
+        jobs: the episodes.
+        progress: whether to show a bar.
+    """
     if not progress:
         yield Display()
         return
@@ -82,7 +84,7 @@ def show_progress(setting: Setting, jobs: Sequence[Job], progress: bool) -> Iter
         rich.progress.TimeRemainingColumn(),
     )
     with rich.progress.Progress(*columns, console=Console(stderr=True)) as bar:
-        yield ProgressBar(bar, setting, len(jobs))
+        yield ProgressBar(bar, words, len(jobs))
 
 
 def watch_making(grid_id: str, made: Iterator[int], total: int, progress: bool) -> None:

@@ -159,17 +159,18 @@ def run_evaluation(
     """
     of_all = labels(identity)
     request = {"identity": dict(identity), "identity_hash": of_all["identity"], "jobs": [list(job) for job in jobs]}
-    with open_store(output, request, command) as store, show_progress(setting, jobs, progress) as display:
+    words = f"Evaluating {setting.agent.name}"
+    with open_store(output, request, command) as store, show_progress(words, jobs, progress) as display:
         done = {_job(episode): episode for episode in store.episodes}
         display.skip(done)
         missing = [job for job in jobs if job not in done]
         if missing:
             with make_crew(setting, workers) as crew:
-                for played in crew.play(missing, display.advance):
+                for job, played in crew.play(missing, display.advance):
                     episode = replace(played, **of_all)
                     store.add(episode)
-                    display.finish(episode)
-                    done[_job(episode)] = episode
+                    display.finish(job, episode.grid_steps)
+                    done[job] = episode
         episodes = tuple(done[job] for job in jobs)
         store.finish(episodes)
     return Evaluation(episodes, identity, command, output)

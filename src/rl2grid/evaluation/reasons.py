@@ -45,7 +45,7 @@ class Reasons:
         base: Any = self._env
         if not intervenes(action) and base.state.rho[0].max() < SAFE_RHO:
             return None
-        considered = _checked(self._agent)
+        considered = explanation_of(self._agent)
         reason_of = self._among_ids if self._discrete else self._among_plans
         return reason_of(action, step, considered)
 
@@ -112,8 +112,12 @@ class Reasons:
             return float("nan")
 
 
-def _checked(agent: Agent) -> Considered | None:
-    """What an agent says, if it says anything."""
+def explanation_of(agent: Agent) -> Considered | None:
+    """What an agent says of its last action, if it says anything.
+
+    Raises:
+        UsageError: it is something else than a ``Considered``.
+    """
     if not isinstance(agent, ExplainingAgent):
         return None
     considered = agent.explain()
