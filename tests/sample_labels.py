@@ -68,6 +68,6 @@ def write_made_up_labels(
         for month in range(labels.n_months):
             made = made_up_labels(task, n, seed=7 * labels.number + month, candidates=request["candidates"])
             written.append(replace(made, pupil=np.full(n, of_round["pupil"] is not None)))
-            row = MonthRow(labels.request, labels.number, month, "generated/1000000-00", month, 0, 100, 1.0, n, n)
+            row = MonthRow(labels.request, labels.number, month, "generated/1000000-00", month, 0, 100, 1.0, n, 0, n)
             labels.add(row, written[-1])
     return written

@@ -6,8 +6,8 @@ Importing the package registers the tasks with Gymnasium::
     env = gymnasium.make("rl2grid/bus14-T0-v0", heuristic="idle")
 
 :func:`tasks` lists them, :func:`train` trains an agent, :func:`load` brings its policy back, and :func:`evaluate` plays
-the episodes by which agents are compared. A grid of one's own gets the same tasks with
-:func:`register_system`.
+the episodes by which agents are compared. :func:`teach` stores what an agent decides, for others to learn from. A grid
+of one's own gets the same tasks with :func:`register_system`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from rl2grid.envs.tasks import Task
     from rl2grid.records.evaluations import Evaluation
 
-__all__ = ["evaluate", "load", "register_system", "tasks", "train"]
+__all__ = ["evaluate", "load", "register_system", "tasks", "teach", "train"]
 __version__ = "1.0.0rc1"
 
 register_all()
@@ -100,6 +100,51 @@ def train(
         progress=progress,
     )
     return runs.train(args, evaluate=find_validator(args))
+
+
+def teach(
+    teacher: str | Path | Agent,
+    task: Task | str,
+    *,
+    months: int = 20,
+    output: str | Path | None = None,
+    seed: int = 0,
+    pupil: str | Path | Agent | None = None,
+    progress: bool = False,
+    **options: Any,
+) -> Path:
+    """Label training months with what a teacher decides; ``rl2grid teach`` does the same, ``docs/labels.md`` says more.
+
+    Args:
+        teacher: Name of an agent without training, such as ``"planner"``, the path of a run folder or checkpoint, or an
+            agent that is not bound to an environment yet.
+        task: The task or its id; the namespace and the version of an id may be left out.
+        months: Of the training library; of a folder that has labels already, as many or more.
+        output: Folder of the labels, to begin or to go on with; None: by task and teacher in ``runs``.
+        seed: Of which months are played.
+        pupil: Who acts while the teacher says what it would do: another round in the same folder.
+        progress: Whether to show a progress bar.
+        options: Keywords of ``gymnasium.make``, such as ``heuristic``, and further ones of
+            :func:`rl2grid.training.teaching.teach`.
+
+    Returns:
+        The folder, which ``rl2grid.records.labels.read_labels`` reads.
+
+    Raises:
+        UsageError: the request cannot be met, or ``output`` holds other labels; nothing was written.
+    """
+    from rl2grid.training import teaching
+
+    return teaching.teach(
+        teacher,
+        task,
+        months=months,
+        output=None if output is None else Path(output),
+        seed=seed,
+        pupil=pupil,
+        progress=progress,
+        **options,
+    ).folder
 
 
 def evaluate(

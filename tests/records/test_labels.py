@@ -243,7 +243,7 @@ def test_forged_files_are_refused_before_they_are_expanded(tmp_path: Path, name:
 def test_what_no_teacher_can_have_said_is_refused(tmp_path: Path, change: dict[str, Any], words: str):
     write_made_up_labels(tmp_path, "bus14-T0")
     with open_labels(tmp_path, request_of("bus14-T0"), NO_PUPIL) as folder:
-        row = MonthRow(folder.request, 0, 1, "generated/1000000-00", 1, 0, 100, 1.0, 20, 20)
+        row = MonthRow(folder.request, 0, 1, "generated/1000000-00", 1, 0, 100, 1.0, 20, 0, 20)
     write_month(month_path(tmp_path, 0, 1), row, replace(made_up_labels("bus14-T0", 20), **change))
     with pytest.raises(UsageError, match=words):
         read_labels([tmp_path], "bus14-T0")

@@ -29,6 +29,7 @@ COMMANDS: dict[str, str] = {
     "tasks": "list the tasks (103 of the paper and 96 joint ones) and their sizes",
     "train": "train an algorithm on a task",
     "pretrained": "list the policies that come with the package, and how each was made",
+    "teach": "label training months with what an agent decides, for another one to learn from",
     "evaluate": "play agents on enumerated scenarios, one row per episode",
     "rank": "rank a grid's topology actions by trying them",
     "analyse": "tables and figures from evaluations and training runs",

@@ -76,6 +76,8 @@ def open_labels(folder: Path, request: Mapping[str, Any], of_round: Mapping[str,
             round has more months already, or the round before it is unfinished.
     """
     check_own(folder, (LABELS_FILE,), "labels")
+    if of_round["pupil"] is not None and not is_labels(folder):
+        raise UsageError(f"{folder} holds no labels yet: label months that the teacher plays first, without a pupil.")
     make_folder(folder)
     try:
         lock = take_lock(folder)
@@ -97,11 +99,10 @@ def _rounds_before(folder: Path, request: Mapping[str, Any]) -> list[dict[str, A
         return []
     stored = read_labels_description(folder)
     rounds: list[dict[str, Any]] = stored.pop("rounds")
-    differing = [name for name in {**stored, **request} if stored.get(name) != request.get(name)]
+    differing = _differing(stored, request)
     if differing:
         raise UsageError(
-            f"{folder} holds other labels, with a different {differing[0].replace('_', ' ')}: choose another folder, "
-            "or remove it."
+            f"{folder} holds other labels, with a different {differing[0]}: choose another folder, or remove it."
         )
     return rounds
 
@@ -115,8 +116,6 @@ def _round_of(folder: Path, rounds: list[dict[str, Any]], of_round: Mapping[str,
                     f"Round {number} of {folder} has {each['months']} months: ask for as many, or for more."
                 )
             return number
-    if not rounds and of_round["pupil"] is not None:
-        raise UsageError(f"{folder} holds no labels yet: label months that the teacher plays first, without a pupil.")
     for number, each in enumerate(rounds):
         done = sum(month_path(folder, number, month).is_file() for month in range(each["months"]))
         if done < each["months"]:
@@ -125,3 +124,15 @@ def _round_of(folder: Path, rounds: list[dict[str, Any]], of_round: Mapping[str,
                 f"`{each['command']}` first."
             )
     return len(rounds)
+
+
+def _differing(stored: Mapping[str, Any], request: Mapping[str, Any]) -> list[str]:
+    """In what two requests differ, in words: the entries of a part that differs, where it has some."""
+    words = []
+    for name in {**stored, **request}:
+        mine, theirs = request.get(name), stored.get(name)
+        if mine != theirs and isinstance(mine, dict) and isinstance(theirs, dict):
+            words += _differing(theirs, mine)
+        elif mine != theirs:
+            words.append(f"{name.replace('_', ' ')} ({theirs}, not {mine})")
+    return words

@@ -69,7 +69,7 @@ _DESCRIPTION = {
 }
 _MONTH = {
     "request": str, "round": int, "number": int, "scenario": str, "seed": int, "start": int, "grid_steps": int,
-    "survival": float, "decisions": int, "labels": int,
+    "survival": float, "decisions": int, "acted": int, "labels": int,
 }  # fmt: skip
 
 
@@ -163,6 +163,8 @@ class MonthRow:
     """Share of the episode that was survived, by whoever acted."""
     decisions: int
     """Of the episode."""
+    acted: int
+    """Those in which the teacher does something."""
     labels: int
     """Decisions that were kept."""
 
