@@ -51,6 +51,6 @@ def write(folder: Path, task: str, change: Change = lambda labels: labels, month
             labels = made_up_labels(task, n, seed=month)
             labels.observations[:, 3:] = 0.0  # so that little suffices to learn what does not matter
             labels = change(labels)
-            row = MonthRow(stored.request, 0, month, f"generated/{month:02d}", month, 0, 100, 1.0, n, n)
+            row = MonthRow(stored.request, 0, month, f"generated/{month:02d}", month, 0, 100, 1.0, n, 0, n)
             stored.add(row, labels)
     return str(folder)
