@@ -111,19 +111,13 @@ class Labeller:
 
     def act(self, observation: Observation, info: Info) -> Action:
         """What is played: the teacher's action, or the pupil's."""
-        mask = self._env.action_masks() if has_topology_actions(self._space) else None
-        action = self._legal(self._teacher.act(observation, info), mask)
+        action = self._legal(self._teacher.act(observation, info))
         acts, by_pupil = intervenes(action), self._pupil_acts()
         self.acted += acts
         asks_for_something = acts or not is_safe(self._env.state, 0)
         drawn = bool(self._thinning.uniform(1)[0] * self._thin < 1.0)
         if asks_for_something or drawn:
-            candidates, values = self._candidates(mask)
-            weight = 1.0 if asks_for_something else self._thin
-            place = len(self._transitions)
-            self._kept.append(
-                _Kept(place, np.array(observation, np.float32), mask, action, candidates, values, weight, by_pupil)
-            )
+            self._keep(observation, action, 1.0 if asks_for_something else self._thin, by_pupil)
         return self._played_by_pupil(action, observation, info) if by_pupil else action
 
     def note(self, lost: bool, completed: bool, info: Info) -> None:
@@ -168,14 +162,22 @@ class Labeller:
             self._teacher.overruled(played)
         return played
 
-    def _legal(self, action: Action, mask: Flags | None) -> Action:
+    def _keep(self, observation: Observation, action: Action, weight: float, by_pupil: bool) -> None:
+        mask = self._env.action_masks() if has_topology_actions(self._space) else None
+        candidates, values = self._candidates(mask)
+        place, seen = len(self._transitions), np.array(observation, np.float32)
+        self._kept.append(_Kept(place, seen, mask, action, candidates, values, weight, by_pupil))
+
+    def _legal(self, action: Action) -> Action:
         """What the environment would play: of an illegal action nothing is kept, neither part.
 
         Raises:
             UsageError: it is no action of the task.
         """
-        step_action(self._task, self._env.grid, self._catalogue, action)
-        if mask is not None and not mask[topology_part(action)]:
+        acts = intervenes(action)
+        if acts or self._pupil is not None:  # else the environment refuses what is no action
+            step_action(self._task, self._env.grid, self._catalogue, action)
+        if acts and has_topology_actions(self._space) and not self._env.action_masks()[topology_part(action)]:
             return no_intervention(self._space)
         return action
 
