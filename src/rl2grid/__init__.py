@@ -59,6 +59,7 @@ def train(
     *,
     folder: str | Path | None = None,
     preset: str = "default",
+    start_from: str | Path | None = None,
     hyperparameters: Mapping[str, Any] | None = None,
     validation_months: int | None = 20,
     evaluate_every: int = 50_000,
@@ -70,10 +71,11 @@ def train(
     ``rl2grid train`` does the same, and ``rl2grid train --resume FOLDER`` goes on with a run that was interrupted.
 
     Args:
-        algorithm: ``"ppo"``, ``"lagrangian-ppo"``, ``"dqn"``, ``"sac"`` or ``"td3"``.
+        algorithm: ``"ppo"``, ``"lagrangian-ppo"``, ``"dqn"``, ``"sac"``, ``"td3"`` or ``"imitation"``.
         task: The task or its id; the namespace and the version of an id may be left out.
         folder: Where the run is written, a folder that does not exist yet; None: ``runs/<task>-<algorithm>-<seed>``.
         preset: Where the hyperparameters come from that are not given.
+        start_from: A run folder or checkpoint whose policy is where it begins; None: a new one.
         hyperparameters: Of the algorithm, such as ``{"total_timesteps": 100_000, "seed": 1}`` (decisions to train for).
         validation_months: How many validation months pick the best policy; None: all, 0: none.
         evaluate_every: Decisions between two validations; there is one more at the end.
@@ -89,9 +91,12 @@ def train(
     from rl2grid.training.validation import find_validator
 
     chosen = find_task(task)
+    changes = dict(hyperparameters or {})
+    if start_from is not None:
+        changes["start_from"] = str(start_from)
     args = request.RunArgs(
         task=chosen,
-        hyperparameters=request.hyperparameters(algorithm, chosen, preset, **(hyperparameters or {})),
+        hyperparameters=request.hyperparameters(algorithm, chosen, preset, **changes),
         algorithm=algorithm,
         folder=None if folder is None else Path(folder),
         env_keywords=options,

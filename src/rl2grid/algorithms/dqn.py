@@ -46,6 +46,7 @@ from rl2grid.algorithms.off_policy import (
     random_legal_actions,
 )
 from rl2grid.algorithms.registry import Algorithm
+from rl2grid.algorithms.starting import StartingPolicy
 from rl2grid.errors import UsageError, one_of
 
 SINGLE, DUELING = "single", "dueling"
@@ -268,6 +269,22 @@ class DQN(OffPolicyTrainer):
         self.target = copy.deepcopy(self.network)
         self.optimizer = adam(self.network, args.learning_rate)
         self._renewals = 0
+
+    def take_over(self, start: StartingPolicy) -> None:
+        """The weights of the values, which are those of the policy.
+
+        Raises:
+            UsageError: they are no values of DQN, or others.
+        """
+        theirs = start.network()
+        if not isinstance(theirs, QNetwork):
+            raise start.refusal("DQN has values and no policy, and goes on with those of dqn alone")
+        if (theirs.dueling, len(theirs.networks)) != (self.network.dueling, len(self.network.networks)):
+            raise start.refusal("it has another head, or another number of networks: set both to the same")
+        if not start.judges_like(self.args, getattr(self.options, "reward", None)):
+            raise start.refusal("its values are of other rewards or of another discount: train with the same")
+        self.network.load_state_dict(theirs.state_dict())
+        self.target.load_state_dict(theirs.state_dict())
 
     @property
     def epsilon(self) -> float:

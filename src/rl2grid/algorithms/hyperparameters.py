@@ -59,6 +59,8 @@ class SharedArgs:
     own."""
     shortlist: int | None = added_later(None)
     """Discrete actions only: among how many it chooses, do nothing and the best-ranked ones; None: all."""
+    start_from: str | None = added_later(None)
+    """A run folder or checkpoint whose policy the run begins with, on the command line ``--from``; None: a new one."""
     torch_threads: int = 1
     """Threads of PyTorch; results are reproducible bit by bit for a given number only."""
     device: str = "cpu"

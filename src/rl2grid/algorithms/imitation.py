@@ -418,8 +418,8 @@ class Imitation(Learner):
                 hyperparameters.
         """
         check_environments(args.algorithm, envs, num_envs=args.num_envs, mask_actions=args.mask_actions)
-        super().__init__(args, spec_of(envs))
-        description, labels = _labels_for(args, self.spec, getattr(envs.unwrapped, "options", None))
+        super().__init__(args, spec_of(envs), getattr(envs.unwrapped, "options", None))
+        description, labels = _labels_for(args, self.spec, self.options)
         self._identity = {**description.identity, "teacher": description.teacher, "rounds": description.rounds}
         self.network = self._policy().to(self.device)
         self.optimizer = Adam(self._groups(), lr=args.actor_learning_rate, eps=1e-5)
@@ -478,10 +478,11 @@ class Imitation(Learner):
 
     def identity(self) -> dict[str, Any]:
         """The labels: who decided them, and their hashes."""
-        return {"labels": self._identity}
+        return {**super().identity(), "labels": self._identity}
 
     def iterate(self) -> dict[str, float]:
         """Learn from ``num_steps`` labels, and return the metrics."""
+        self.begin_as_asked()
         args = self.args
         rates = self._set_learning_rates()
         history: list[tuple[Errors, Batch, Tensor]] = []

@@ -43,17 +43,18 @@ from torch import Tensor, nn
 
 from rl2grid.algorithms.descent import Adam, descend
 from rl2grid.algorithms.diagnostics import mean
-from rl2grid.algorithms.hyperparameters import SharedArgs
 from rl2grid.algorithms.networks import PER_ACTION, VALUE, NetworkFactory, orthogonal
 from rl2grid.algorithms.playing import Tally
 from rl2grid.algorithms.sampling import drawn
+from rl2grid.algorithms.starting import StartingPolicy
+from rl2grid.algorithms.teacher import TeacherArgs, categorical_divergences, gaussian_divergences
 from rl2grid.algorithms.trainer import Played, Trainer
 
 # --- Hyperparameters ------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class OnPolicyArgs(SharedArgs):
+class OnPolicyArgs(TeacherArgs):
     """Hyperparameters that the algorithms share."""
 
     num_steps: int = 64
@@ -168,6 +169,11 @@ class ActorCritic(nn.Module):
         actions = drawn(log_probabilities.exp(), generator).to(output.device)
         return actions, log_probabilities.gather(-1, actions.unsqueeze(-1)).squeeze(-1)
 
+    def distribution(self, observations: Tensor, masks: Tensor | None) -> tuple[Tensor, ...]:
+        """Log-probabilities [batch, actions]; or means [batch, dimensions] and log standard deviations [dimensions]."""
+        output = self.actor(observations)
+        return (output, self.log_std) if self.continuous else (legal_log_softmax(output, masks),)
+
     def preferences(self, observations: Tensor, masks: Tensor | None) -> Tensor:
         """Probabilities of discrete actions, [batch, actions]."""
         return legal_log_softmax(self.actor(observations), masks).exp()
@@ -196,6 +202,13 @@ def legal_log_softmax(logits: Tensor, masks: Tensor | None) -> Tensor:
     if masks is not None:
         logits = logits.masked_fill(~masks, ILLEGAL_LOGIT)
     return logits.log_softmax(dim=-1)
+
+
+def divergences(teacher: tuple[Tensor, ...], pupil: tuple[Tensor, ...]) -> Tensor:
+    """KL(teacher || pupil) [batch] of what :meth:`ActorCritic.distribution` says."""
+    if len(teacher) == 1:
+        return categorical_divergences(*teacher, *pupil)
+    return gaussian_divergences((teacher[0], teacher[1]), (pupil[0], pupil[1]))
 
 
 def load_policy(state: Mapping[str, Any]) -> ActorCritic:
@@ -381,6 +394,32 @@ class OnPolicyTrainer(Trainer):
         self._groups = (self.network.actor_parameters(), *(list(critic.parameters()) for critic in critics))
         groups = [{"params": parameters} for parameters in self._groups]
         self.optimizer = Adam(groups, lr=args.actor_learning_rate, eps=1e-5)
+        self.teacher: ActorCritic | None = None
+        """What the policy was at the beginning, if it is that of another run."""
+        self._divergences: list[Tensor] = []
+
+    def take_over(self, start: StartingPolicy) -> None:
+        """The policy's weights, and those of the critic if rewards and their discount are the same.
+
+        Raises:
+            UsageError: it is no policy of these algorithms.
+        """
+        theirs = start.network()
+        if not isinstance(theirs, ActorCritic):
+            raise start.refusal(
+                f"{self.args.algorithm} goes on with those of ppo, lagrangian-ppo, or imitation with policy ppo"
+            )
+        self.network.actor.load_state_dict(theirs.actor.state_dict())
+        if self.continuous:
+            self.network.log_std.data.copy_(theirs.log_std.data)
+        if start.judges_like(self.args, getattr(self.options, "reward", None)):
+            self.network.critic.load_state_dict(theirs.critic.state_dict())
+        self.teacher = theirs.requires_grad_(False).to(self.device)
+
+    @property
+    def teacher_coefficient(self) -> float:
+        """Weight of what keeps the policy near its teacher (:mod:`rl2grid.algorithms.teacher`)."""
+        return 0.0 if self.teacher is None else self.args.teacher_coefficient_at(self.decisions)
 
     @abstractmethod
     def update(self, rollout: Any) -> dict[str, float]:
@@ -401,7 +440,12 @@ class OnPolicyTrainer(Trainer):
         rollout, metrics = self.collect()
         metrics["charts/grid_steps"] = float(self.grid_steps)
         metrics |= self.before_update()
+        self._divergences = []
         metrics |= self.update(rollout)
+        if self.teacher is not None:
+            metrics["charts/teacher_coefficient"] = self.teacher_coefficient
+            if self._divergences:
+                metrics["losses/teacher_kl"] = mean(self._divergences)
         if self.continuous:
             metrics["charts/action_std"] = float(self.network.log_std.detach().exp().mean())
         self.iteration += 1
@@ -507,6 +551,8 @@ class OnPolicyTrainer(Trainer):
         """Let the step sizes follow their schedule; those of the actor and of the critics."""
         remaining = 1.0 - self.iteration / self.num_iterations if self.args.anneal_learning_rate else 1.0
         rates = (remaining * self.args.actor_learning_rate, remaining * self.args.critic_learning_rate)
+        if self.decisions <= (self.args.actor_starts or 0):
+            rates = (0.0, rates[1])
         actor, *critics = self.optimizer.param_groups
         actor["lr"] = rates[0]
         for critic in critics:
@@ -529,5 +575,16 @@ class OnPolicyTrainer(Trainer):
 
     def _descend(self, batch: Minibatch) -> Losses:
         loss = self.losses(batch)
-        descend(self.optimizer, loss.total, self.args.max_grad_norm)
+        descend(self.optimizer, self._near_teacher(loss.total, batch), self.args.max_grad_norm)
         return replace(loss, total=loss.total.detach())
+
+    def _near_teacher(self, loss: Tensor, batch: Minibatch) -> Tensor:
+        """The loss, and what keeps the policy near its teacher."""
+        coefficient = self.teacher_coefficient
+        if self.teacher is None or not coefficient:
+            return loss
+        with torch.no_grad():
+            said = self.teacher.distribution(batch.observations, batch.masks)
+        divergence = divergences(said, self.network.distribution(batch.observations, batch.masks)).mean()
+        self._divergences.append(divergence.detach())
+        return loss + coefficient * divergence

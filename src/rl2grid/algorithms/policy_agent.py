@@ -186,8 +186,19 @@ def load_agent(
         UsageError: no checkpoint there, or one of another task or another version of rl2grid.
     """
     if is_pretrained(path):
-        card = pretrained(path)
-        path, name = card.file, name or f"pretrained-{card.name}"
+        name = name or f"pretrained-{pretrained(path).name}"
+    file, contents = read_policy(path, task)
+    return agent_of(file, contents, deterministic=deterministic, name=name)
+
+
+def read_policy(path: Path, task: Task | str | None = None) -> tuple[Path, dict[str, Any]]:
+    """The file in which the policy of a checkpoint or run folder is, and its sections; see :func:`load_agent`.
+
+    Raises:
+        UsageError: no checkpoint there, or one of another task.
+    """
+    if is_pretrained(path):
+        path = pretrained(path).file
     path = Path(path)
     if path.is_dir():
         best = path / BEST_FILE
@@ -197,6 +208,17 @@ def load_agent(
         _check_place(path, contents)
     if "policy" not in contents and contents.get("decisions") == 0:
         raise UsageError(f"Checkpoint {str(path)!r} has no policy yet: its run has just begun.")
+    return path, contents
+
+
+def agent_of(
+    path: Path, contents: Mapping[str, Any], *, deterministic: bool = True, name: str | None = None
+) -> PolicyAgent:
+    """The agent of what :func:`read_policy` returned.
+
+    Raises:
+        UsageError: another version of rl2grid wrote it, or nobody learned it.
+    """
     try:
         _check_policy(path, contents["policy"])
         return PolicyAgent(contents, deterministic=deterministic, name=name)

@@ -58,12 +58,14 @@ from rl2grid.algorithms.off_policy import (
 )
 from rl2grid.algorithms.registry import Algorithm
 from rl2grid.algorithms.sampling import drawn
+from rl2grid.algorithms.starting import StartingPolicy
+from rl2grid.algorithms.teacher import TeacherArgs, categorical_divergences, gaussian_divergences
 
 # --- Hyperparameters ------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class Args(OffPolicyArgs):
+class Args(OffPolicyArgs, TeacherArgs):
     """Hyperparameters; the presets below change some of the values here."""
 
     algorithm: ClassVar[str] = "SAC"
@@ -396,6 +398,33 @@ class SAC(OffPolicyTrainer):
         self.actor_optimizer = adam(self.actor, args.actor_learning_rate)
         self.critic_optimizer = adam(self.critics, args.critic_learning_rate)
         self.temperature_optimizer = adam(self.temperature, args.temperature_learning_rate)
+        self.teacher: GaussianActor | CategoricalActor | None = None
+        """What the policy was at the beginning, if it is that of another run."""
+
+    def take_over(self, start: StartingPolicy) -> None:
+        """The policy's weights; critics begin anew.
+
+        Raises:
+            UsageError: it is no policy of SAC.
+        """
+        theirs = start.network()
+        if not isinstance(theirs, GaussianActor | CategoricalActor):
+            raise start.refusal("SAC goes on with those of sac, or imitation with policy sac")
+        self.actor.load_state_dict(theirs.state_dict())
+        self.teacher = theirs.requires_grad_(False).to(self.device)
+
+    @property
+    def teacher_coefficient(self) -> float:
+        """Weight of what keeps the policy near its teacher (:mod:`rl2grid.algorithms.teacher`)."""
+        return 0.0 if self.teacher is None else self.args.teacher_coefficient_at(self.decisions)
+
+    @property
+    def actor_starts(self) -> int:
+        """Decisions before the policy is changed: critics begin anew, and would make it worse before they know it."""
+        asked = self.args.actor_starts
+        if asked is not None:
+            return asked
+        return 0 if self.teacher is None else self.args.total_timesteps // 10
 
     def _continuous(self) -> ContinuousObjective:
         actor = GaussianActor(self.networks, self.args.actor_layers).to(self.device)
@@ -409,8 +438,13 @@ class SAC(OffPolicyTrainer):
 
     @property
     def entropy_share(self) -> float:
-        """Discrete actions: target entropy at this moment, as a share of the largest possible one."""
+        """Discrete actions: target entropy at this moment, as a share of the largest possible one.
+
+        With a teacher it is that of the end all along: what was imitated is not to be forgotten by chance.
+        """
         args = self.args
+        if self.teacher is not None:
+            return args.last_entropy_share
         progress = min(1.0, self.decisions / args.total_timesteps)
         return args.first_entropy_share + progress * (args.last_entropy_share - args.first_entropy_share)
 
@@ -426,7 +460,7 @@ class SAC(OffPolicyTrainer):
     def explore(self, observations: Tensor, masks: Tensor | None) -> Tensor:
         """Samples of the policy; uniform actions before it learns, if asked for."""
         count = len(observations)
-        if self.is_starting and self.args.random_start:
+        if self.is_starting and self.args.random_start and self.teacher is None:
             if self.continuous:
                 return torch.rand(count, self.action_size, generator=self.generator) * 2.0 - 1.0
             return random_legal_actions(count, self.action_size, masks, self.generator)
@@ -441,15 +475,20 @@ class SAC(OffPolicyTrainer):
         error = critic_loss(values, aims)
         self._descend(self.critic_optimizer, error)
         metrics = {"losses/qf_loss": error, "losses/qf_values": values.mean(), "losses/alpha": alpha}
-        if self.updates % args.policy_frequency == 0:
+        if self.updates % args.policy_frequency == 0 and self.decisions >= self.actor_starts:
             metrics |= self._improve_policy(batch, alpha)
         follow(self.slow, self.critics, args.tau)
         return metrics
 
     def _improve_policy(self, batch: Batch, alpha: Tensor) -> dict[str, Tensor]:
         policy = self.objective.policy_loss(batch, alpha, self._noise(batch))
-        self._descend(self.actor_optimizer, policy.loss)
         metrics = {"losses/actor_loss": policy.loss, "losses/entropy": policy.entropies.mean()}
+        loss, coefficient = policy.loss, self.teacher_coefficient
+        if self.teacher is not None and coefficient:
+            divergence = self._divergences(self.teacher, batch).mean()
+            loss = loss + coefficient * divergence
+            metrics["losses/teacher_kl"] = divergence
+        self._descend(self.actor_optimizer, loss)
         if not self.args.tune_temperature:
             return metrics
         aims = self.target_entropies(batch)
@@ -457,14 +496,25 @@ class SAC(OffPolicyTrainer):
         self._descend(self.temperature_optimizer, loss)
         return {**metrics, "losses/alpha_loss": loss, "losses/target_entropy": aims.mean()}
 
+    def _divergences(self, teacher: nn.Module, batch: Batch) -> Tensor:
+        """KL(teacher || policy) in every state of the batch [batch]."""
+        if self.continuous:
+            with torch.no_grad():
+                said = teacher(batch.observations)
+            return gaussian_divergences(said, self.actor(batch.observations))
+        with torch.no_grad():
+            said = teacher(batch.observations, batch.masks)
+        return categorical_divergences(said, self.actor(batch.observations, batch.masks))
+
     def _noise(self, batch: Batch) -> Tensor:
         """Standard normal numbers [batch, dimensions]; none for discrete actions."""
         shape = (len(batch.observations), self.action_size if self.continuous else 0)
         return torch.randn(shape, generator=self.generator).to(self.device)
 
     def schedule(self) -> dict[str, float]:
-        """The share of the largest entropy that is aimed at."""
-        return {} if self.continuous else {"charts/entropy_share": self.entropy_share}
+        """The share of the largest entropy that is aimed at, and the weight of what keeps it near its teacher."""
+        metrics = {} if self.continuous else {"charts/entropy_share": self.entropy_share}
+        return metrics if self.teacher is None else {**metrics, "charts/teacher_coefficient": self.teacher_coefficient}
 
     def learned(self) -> Mapping[str, nn.Module | torch.optim.Optimizer]:
         """See :class:`OffPolicyTrainer`."""

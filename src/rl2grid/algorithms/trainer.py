@@ -41,6 +41,7 @@ from rl2grid.algorithms.playing import (
     reported,
     resume_environments,
 )
+from rl2grid.algorithms.starting import StartingPolicy, read_starting_policy
 from rl2grid.envs.normalization import CLIP, ObservationNormalizer
 from rl2grid.envs.spec import Spec, spec_of
 from rl2grid.errors import UsageError
@@ -76,12 +77,13 @@ class Learner(ABC):
     deterministic_on: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
     """Types of device on which only PyTorch's deterministic algorithms are used."""
 
-    def __init__(self, args: SharedArgs, spec: Spec) -> None:
+    def __init__(self, args: SharedArgs, spec: Spec, options: Any = None) -> None:
         """Everything but the networks.
 
         Args:
             args: Hyperparameters.
             spec: What is observed and what can be done.
+            options: Keywords of the environments, :class:`~rl2grid.envs.options.TaskOptions`; None: not known.
 
         Raises:
             UsageError: the network cannot read what these hyperparameters give it.
@@ -105,6 +107,9 @@ class Learner(ABC):
         self.normalizer = ObservationNormalizer(self.observation_size) if args.normalize_observations else None
         self._scale_of = -1
         self.reward_scale = 1.0 - args.gamma if args.reward_scale is None else args.reward_scale
+        self.options: Any = options
+        self.start: StartingPolicy | None = None
+        """The policy of another run that this one began with."""
 
         self.num_iterations = args.total_timesteps // (args.num_envs * args.num_steps)
         self.iteration = 0
@@ -149,7 +154,41 @@ class Learner(ABC):
 
     def identity(self) -> dict[str, Any]:
         """What results must name beside versions and hashes of the task: what it learns from and began with."""
-        return {}
+        return {} if self.start is None else {"start": self.start.identity()}
+
+    def begin_as_asked(self) -> None:
+        """Begin with the policy of ``Args.start_from``, if there is one and nothing was begun yet.
+
+        Raises:
+            UsageError: there is no policy there, or none that this learner can begin with.
+        """
+        if self.args.start_from is not None and self.start is None:
+            self.begin_with(read_starting_policy(self.args.start_from, self.spec.task))
+
+    def begin_with(self, start: StartingPolicy) -> None:
+        """Take over the weights of a policy, and for good the statistics by which it reads observations.
+
+        Raises:
+            UsageError: this learner cannot begin with it.
+        """
+        start.check(self.args, self.spec, self.options)
+        self.take_over(start)
+        self.start = start
+        if self.normalizer is not None:
+            self.normalizer.load_state_dict(start.policy["normalizer"])
+            self.normalizer.freeze()
+            self._scale_of = -1
+
+    def take_over(self, start: StartingPolicy) -> None:
+        """Take over the weights of a policy; most algorithms do not.
+
+        Raises:
+            UsageError: they are of another kind.
+        """
+        raise UsageError(
+            f"{self.args.algorithm} cannot begin with the policy of another run: leave start_from out (--from); ppo, "
+            "lagrangian-ppo, sac and dqn can."
+        )
 
     @abstractmethod
     def iterate(self) -> dict[str, float]:
@@ -187,6 +226,7 @@ class Learner(ABC):
             "iteration": self.iteration,
             "decisions": self.decisions,
             "grid_steps": self.grid_steps,
+            **({} if self.start is None else {"start": self.start.state_dict()}),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -195,6 +235,8 @@ class Learner(ABC):
         Raises:
             UsageError: what it learns from is not where it was.
         """
+        if "start" in state:
+            self.begin_with(StartingPolicy(**state["start"]))
         for name, part in self.learned().items():
             part.load_state_dict(state[name])
         if self.normalizer is not None:
@@ -239,7 +281,7 @@ class Trainer(Learner):
         """
         check_environments(args.algorithm, envs, num_envs=args.num_envs, mask_actions=args.mask_actions)
         check_discount(args.algorithm, envs, args.gamma)
-        super().__init__(args, spec_of(envs))
+        super().__init__(args, spec_of(envs), getattr(envs.unwrapped, "options", None))
         self.envs = envs
         self.observations: NDArray[np.float32] | None = None
         """What the environments show, as they give it."""
@@ -276,7 +318,8 @@ class Trainer(Learner):
         resume_environments(self.envs, state["envs"], self.observations)
 
     def reset(self) -> NDArray[np.float32]:
-        """Begin the first episodes; what they show."""
+        """Begin the first episodes, with the policy that was asked for; what they show."""
+        self.begin_as_asked()
         observations: NDArray[np.float32]
         observations, infos = self.envs.reset(seed=self.args.seed * self.args.num_envs)
         everywhere = np.ones(self.args.num_envs, np.bool_)

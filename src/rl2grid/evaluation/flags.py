@@ -10,8 +10,9 @@ from typing import Any
 from rl2grid.envs.options import TaskOptions
 from rl2grid.envs.tasks import Task, short_id
 
-_FLAGS = {"total_timesteps": "decisions"}
-"""Hyperparameters that have the name of CleanRL, and the word that every command has for the same thing."""
+_FLAGS = {"total_timesteps": "decisions", "start_from": "from"}
+"""Hyperparameters that have the name of CleanRL, and the word that every command has for the same thing; or a name
+beside a word that Python keeps for itself."""
 
 
 def flag_of(name: str) -> str:

@@ -191,8 +191,11 @@ def read_training_run(folder: Path, label: str | None = None) -> TrainingRun:
     hyperparameters = dict(request["hyperparameters"])
     seed = int(hyperparameters.pop("seed"))
     task, algorithm, keywords = request["task"], request["algorithm"], request["env_keywords"]
+    # Runs of one method may each begin with a policy of their own.
+    hyperparameters.pop("start_from", None)
     settings = {
-        **{key: value for key, value in identity.items() if key != "seed"},
+        **{key: value for key, value in identity.items() if key not in ("seed", "start")},
+        "started from": identity.get("start", {}).get("algorithm"),
         **keywords,
         **hyperparameters,
         "algorithm": algorithm,

@@ -32,6 +32,7 @@ from rl2grid.algorithms.checkpoint import load_checkpoint, save_checkpoint
 from rl2grid.algorithms.metrics import MetricsWriter
 from rl2grid.algorithms.policy_agent import BEST_FILE, CHECKPOINT_FILE, PolicyAgent
 from rl2grid.algorithms.registry import VectorEnvironment, find_algorithm
+from rl2grid.algorithms.starting import StartingPolicy
 from rl2grid.algorithms.trainer import Learner
 from rl2grid.envs.joint import VectorJointAsBox, VectorJointAsDiscrete
 from rl2grid.envs.options import changed_options
@@ -108,6 +109,7 @@ def train(
     envs = make_envs(args)
     try:
         trainer = find_algorithm(args.algorithm).trainer(args.hyperparameters, envs)
+        trainer.begin_as_asked()
         identity = identity_of(args) | trainer.identity()
         run = _Run(folder, args, identity, trainer, evaluate)
         create_run_folder(folder, configuration_of(args, identity), run.save_beginning)
@@ -154,7 +156,9 @@ def resume(
                     raise UsageError(
                         f"The run in {str(folder)!r} cannot be resumed: its {name} are no longer those it began with."
                     )
-            now |= trainer.identity()
+            now |= {name: identity[name] for name in ("labels", "start") if name in identity}
+            if "start" in checkpoint:
+                trainer.begin_with(StartingPolicy(**checkpoint["start"]))
             run = _Run(folder, args, now, trainer, evaluate)
             if identity.get("versions") != now["versions"]:
                 run.note(f"library versions differ from those the run began with: {now['versions']}")
@@ -226,7 +230,9 @@ class _Run:
 
     def save_beginning(self, folder: Path) -> None:
         """Write a ``checkpoint.pt`` that nothing was learned for yet: where there is none, it was lost."""
-        save_checkpoint(folder / CHECKPOINT_FILE, {**self._description(), "run": self._progress()})
+        start = self.trainer.start
+        begun_with = {} if start is None else {"start": start.state_dict()}
+        save_checkpoint(folder / CHECKPOINT_FILE, {**self._description(), "run": self._progress(), **begun_with})
 
     def _description(self) -> dict[str, Any]:
         return {

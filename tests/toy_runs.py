@@ -64,7 +64,7 @@ def toy_run(folder: Path, algorithm: str, task: str, **changes: Any) -> RunArgs:
     """A request for a small training with any algorithm, some hyperparameters changed."""
     if algorithm == "ppo":
         return request(folder, task=task, hyperparameters=replace(SMALL, **changes))
-    args = hyperparameters(algorithm, task, **SIZES, **LAYERS[algorithm], **changes)
+    args = hyperparameters(algorithm, task, **{**SIZES, **LAYERS[algorithm], **changes})
     return request(folder, algorithm=algorithm, task=task, hyperparameters=args)
 
 
