@@ -263,6 +263,22 @@ def test_statistics_count_an_observation_as_often_as_it_stands_for():
     np.testing.assert_allclose(weighted.variance, repeated.variance, rtol=1e-9)
 
 
+def test_a_policy_with_a_shortlist_learns_of_the_actions_on_it(tmp_path: Path):
+    folder = write(tmp_path / "labels", "bus14-T0", months=4)
+    imitation = learner(folder, "bus14-T0", shortlist=10, total_timesteps=4_000)
+    rows = imitation.examples.rows(np.arange(len(imitation.examples)))
+    assert rows.masks is not None
+    assert rows.topology is not None
+    assert imitation.shortlisted is not None
+    on_it = torch.as_tensor(imitation.shortlisted)
+    assert not (rows.masks & ~on_it).any()
+    assert ((rows.weights > 0) == on_it[rows.topology]).all()
+    assert on_it[rows.candidates[rows.candidates >= 0]].all()
+    metrics = learned(imitation)
+    assert metrics["losses/imitation_loss"] < 10.0
+    assert metrics["charts/agreement"] < 0.9  # what is not on it cannot be agreed with
+
+
 # --- What is held out -----------------------------------------------------------------------------------------------
 
 

@@ -42,7 +42,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
@@ -106,8 +106,8 @@ class Args(SharedArgs):
     """Whether both step sizes fall linearly to zero over the run."""
     soft_share: float = 0.25
     """Share of the teacher's values in what is imitated, where it tells any; the rest is its action."""
-    soft_temperature: float = 0.1
-    """Difference of two values that makes one action e times as desirable as the other."""
+    soft_temperature: float = 0.02
+    """Difference of two values, of loadings mostly, that makes one action e times as desirable as the other."""
     label_smoothing: float = 0.0
     """Share of the legal actions, all alike, in what is imitated."""
     acting_weight: float | None = None
@@ -246,6 +246,19 @@ def chosen_rows(labels: Labels, rows: NDArray[Any]) -> Labels:
     columns: dict[str, Any] = {each.name: getattr(labels, each.name) for each in fields(Labels)}
     kept: dict[str, Any] = {name: None if column is None else column[rows] for name, column in columns.items()}
     return Labels(**kept)
+
+
+def shortlisted(labels: Labels, weights: F32, on_it: Flags) -> tuple[Labels, F32]:
+    """Labels of a policy that knows no other actions than those on a shortlist, bool [action], and their weights [n].
+
+    What the teacher plays besides teaches nothing, and is not agreed with.
+    """
+    assert labels.masks is not None
+    assert labels.topology is not None
+    known = np.where(labels.candidates == NO_CANDIDATE, False, on_it[labels.candidates])
+    candidates = np.where(known, labels.candidates, NO_CANDIDATE)
+    changed = replace(labels, masks=labels.masks & on_it, candidates=candidates)
+    return changed, np.where(on_it[labels.topology], weights, np.float32(0.0))
 
 
 def teacher_acts(labels: Labels) -> Flags:
@@ -474,6 +487,8 @@ class Imitation(Learner):
     def _examples(self, labels: Labels, factor: float, scale: float) -> Examples:
         acts = teacher_acts(labels)
         weights = (labels.weights * np.where(acts, factor, 1.0) / scale).astype(np.float32)
+        if self.shortlisted is not None:
+            labels, weights = shortlisted(labels, weights, self.shortlisted)
         return Examples(labels, self.normalized(labels.observations), weights, acts, self.reward_scale)
 
     def identity(self) -> dict[str, Any]:

@@ -79,6 +79,8 @@ class StartingPolicy:
         network = self.policy["factory"]["name"]
         if network != args.network:
             raise self.refusal(f"its network is {network!r}, not {args.network!r}: set network to the former")
+        if self.policy["factory"].get("shortlist") != args.shortlist:
+            raise self.refusal(f"its shortlist is {self.policy['factory'].get('shortlist')}: set shortlist to the same")
         scaled = self.policy["normalizer"] is not None
         if scaled != args.normalize_observations:
             raise self.refusal(f"normalize_observations is {scaled} there: set it to the same")

@@ -103,7 +103,8 @@ class Learner(ABC):
                 "normalize_observations to False."
             )
         self.networks = NetworkFactory(self.spec, args.network, self.generator, args.shortlist)
-        self._shortlisted = self._on_shortlist()
+        self.shortlisted = self._on_shortlist()
+        """Actions that may be chosen at all, bool [action]; None: all."""
         self.normalizer = ObservationNormalizer(self.observation_size) if args.normalize_observations else None
         self._scale_of = -1
         self.reward_scale = 1.0 - args.gamma if args.reward_scale is None else args.reward_scale
@@ -132,16 +133,6 @@ class Learner(ABC):
         on_it = np.zeros(self.action_size, np.bool_)
         on_it[chosen] = True
         return on_it
-
-    def masks(self) -> NDArray[np.bool_] | None:
-        """The actions that may be chosen now, bool [num_envs, action]; None: all.
-
-        They are legal, and on the shortlist where there is one.
-        """
-        if not self.args.mask_actions:
-            return None
-        masks: NDArray[np.bool_] = self.envs.action_masks()  # type: ignore[attr-defined]
-        return masks if self._shortlisted is None else masks & self._shortlisted
 
     @property
     def finished(self) -> bool:
@@ -326,6 +317,16 @@ class Trainer(Learner):
         self._over = reported(infos, "over", ~everywhere)
         self.begin_episodes(infos, everywhere)
         return observations
+
+    def masks(self) -> NDArray[np.bool_] | None:
+        """The actions that may be chosen now, bool [num_envs, action]; None: all.
+
+        They are legal, and on the shortlist where there is one.
+        """
+        if not self.args.mask_actions:
+            return None
+        masks: NDArray[np.bool_] = self.envs.action_masks()  # type: ignore[attr-defined]
+        return masks if self.shortlisted is None else masks & self.shortlisted
 
     def step(self, actions: NDArray[Any], tally: Tally) -> Played:
         """Play a decision in every environment and count it.
