@@ -47,6 +47,7 @@ from rl2grid.records.entries import read_entry, write_entry
 from rl2grid.records.evaluation_folder import FolderStore
 from rl2grid.records.evaluations import load_evaluation, read_description
 from rl2grid.records.files import CHECKSUM, DamageWarning, write_json, write_record
+from rl2grid.records.labels import read_labels
 from rl2grid.records.ledger import add_test, hashed_test, read_ledger
 from rl2grid.records.searches import read_search, write_search
 from rl2grid.records.studies import read_result
@@ -63,6 +64,7 @@ from rl2grid.studies.states import read_states
 from rl2grid.studies.study import load_study, parse_study
 from rl2grid.training import request, runs
 from rl2grid.training.limits import TimeLimit
+from rl2grid.training.teaching import teach
 
 RESULTS = Path(__file__).parent / "results" / "damage.json"
 TASK = find_task("bus14-T0")
@@ -117,6 +119,7 @@ def make_samples(folder: Path) -> None:
         for algorithm in ("ppo", "dqn"):
             run = _train(folder / f"{algorithm}-{name}", algorithm, seed=number + 1)
             write_tracking(run, f"id{number}")
+        teach("greedy", TASK, months=2, output=folder / f"labels-{name}", seed=number, workers=0, episode_length=200)
         results = folder / f"results-{name}"
         results.mkdir()
         write_entry(results / "entry.json", make_entry(folder / f"evaluation-{name}"))
@@ -249,6 +252,11 @@ def _played(folder: Path) -> Any:
     return result.episodes, result.identity, result.command
 
 
+def _learned_from(folder: Path) -> Any:
+    description, labels = read_labels([folder], TASK.id)
+    return description, [None if each is None else each.tobytes() for each in vars(labels).values()]
+
+
 def _gone_on(folder: Path) -> Any:
     months = list_scenarios("bus14", "validation")[:2]
     result = evaluate("random", TASK, scenarios=months, seeds=[0], output=folder)
@@ -319,6 +327,8 @@ KINDS = (
     Kind("evaluation.json", "evaluation", "evaluation.json", _played),
     Kind("episodes.csv", "evaluation", "episodes.csv", _played),
     Kind("episodes.partial.csv", "partial", "episodes.partial.csv", _gone_on, 0.2),
+    Kind("labels.json", "labels", "labels.json", _learned_from),
+    Kind("labels of a month", "labels", "round-*/*.npz", _learned_from),
     Kind("cell.json", "study", "cells/*/cell.json", _collected, 0.5),
     Kind("result.json", "study", "cells/*/result.json", _collected, 0.5),
     Kind("study.json", "study", "study.json", _collected, 0.5),

@@ -1,10 +1,10 @@
 """Kills at random moments: what was killed is called again, and must end as if nothing had happened.
 
 ``python benchmarks/kills.py [--kills 200] [--seed 0] [--only SUBJECT ...]`` lets every subject (trainings of all
-algorithms, an evaluation, a study, the making of months, a ranking, the first compilation) run once in peace. Then it
-runs again with the whole group of processes killed (SIGKILL) at a moment drawn from the time that it took (the shortest
-so far), is called again as a user would, killed again, and at last left in peace. What it leaves must equal what it
-left the first time. A call that ends by itself before its moment is not counted as a kill. Writes
+algorithms, an evaluation, labels, a study, the making of months, a ranking, the first compilation) run once in peace.
+Then it runs again with the whole group of processes killed (SIGKILL) at a moment drawn from the time that it took (the
+shortest so far), is called again as a user would, killed again, and at last left in peace. What it leaves must equal
+what it left the first time. A call that ends by itself before its moment is not counted as a kill. Writes
 ``benchmarks/results/kills.json``.
 """
 
@@ -147,6 +147,11 @@ def _ranked(folder: Path) -> Any:
     )
 
 
+def _labelled(folder: Path) -> Any:
+    months = sorted((folder / "labels").glob("round-*/*.npz"))
+    return [(path.name, hashlib.sha256(path.read_bytes()).hexdigest()) for path in months]
+
+
 def _study(folder: Path) -> list[str]:
     (folder / "study.toml").write_text(STUDY)
     return ["study", "run", str(folder / "study.toml"), "--output", str(folder / "study"), "--jobs", "2"]
@@ -155,6 +160,11 @@ def _study(folder: Path) -> list[str]:
 def _evaluation(folder: Path) -> list[str]:
     output = str(folder / "evaluation")
     return ["evaluate", "greedy", "bus14-T0", "--heuristic", "idle", "--months", "8", "--output", output]
+
+
+def _teaching(folder: Path) -> list[str]:
+    return ["teach", "greedy", "bus14-T0", "--months", "6", "--episode-length", "2016",
+            "--output", str(folder / "labels")]  # fmt: skip
 
 
 def _generation(folder: Path) -> list[str]:
@@ -173,6 +183,7 @@ def _compilation(folder: Path) -> list[str]:
 SUBJECTS = (
     *map(_training, TRAININGS),
     Subject("evaluate", _evaluation, _evaluation, _evaluated),
+    Subject("teach", _teaching, _teaching, _labelled),
     Subject("study", _study, _study, _studied),
     Subject("make months", _generation, _generation, _made, own_data=True),
     Subject("rank", _ranking, _ranking, _ranked),

@@ -35,6 +35,8 @@ def test_labels_are_made_told_and_go_on(capsys: pytest.CaptureFixture[str], tmp_
     assert (told["folder"], told["round"], told["months"], told["labels"]) == (str(folder), 0, 3, 60)
     assert main([*command, "--months", "3", "--pupil", "random", "--pupil-share", "0.5", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["round"] == 1
+    assert main([*command, "--months", "3", "--pupil", "random", "--pupil-share", "0.5", "--quiet"]) == 0
+    assert capsys.readouterr().out.endswith(" with random acting.\n")
     assert month_path(folder, 1, 2).is_file()
     assert read_labels([folder], "bus14-T0")[0].rounds == 2
 

@@ -72,7 +72,8 @@ def _run(options: argparse.Namespace, output: Output) -> int:
     output.text(
         f"{summary['labels']:,} labels of {taught.teacher} in {taught.folder}, round {taught.round}: "
         f"{summary['months']:,} months of {short_id(task.id)}, {summary['decisions']:,} decisions, "
-        f"{summary['acted']:,} actions of the teacher, survival {summary['survival']:.3f}."
+        f"{summary['acted']:,} actions of the teacher, survival {summary['survival']:.3f}"
+        f"{f' with {taught.pupil} acting' if taught.pupil else ''}."
     )
     return 0
 

@@ -101,6 +101,9 @@ class Taught:
     folder: Path
     round: int
     teacher: str
+    """Its name."""
+    pupil: str | None
+    """The name of who acted; None: the teacher."""
     months: tuple[MonthRow, ...]
 
 
@@ -174,7 +177,8 @@ def teach(
     with open_labels(folder, _request(setup, seed), _round(setup, months, call)) as labels:
         named = all(isinstance(each, str | Path | None) for each in (teacher, pupil))
         rows = _label(setup, labels, seed, _number_of_workers(workers, named), progress)
-    return Taught(folder, labels.number, printable(chosen.name), rows)
+    who = None if learner is None else printable(learner.name)
+    return Taught(folder, labels.number, printable(chosen.name), who, rows)
 
 
 def _label(setup: LabelSetup, folder: LabelFolder, seed: int, workers: int, progress: bool) -> tuple[MonthRow, ...]:
