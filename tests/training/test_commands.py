@@ -27,6 +27,10 @@ CASES: list[tuple[str, str, str, dict[str, Any], dict[str, Any]]] = [
     ("dqn", "bus36-M-T0", "default", {"mask_actions": False, "huber_delta": None}, {"reward": "paper"}),
     ("ppo", "bus14-T0", "paper", {"torch_threads": 2, "device": "auto"}, {"scenario": "a month/of its own"}),
     ("ppo", "bus14-T0", "default", {}, {"episode_length": 2016}),
+    ("ppo", "bus14-H0", "default", {"joint_actions": "box", "gamma": 0.9, "mask_actions": False}, {}),
+    ("ppo", "bus14-T0", "default", {"start_from": "runs/a run", "teacher_coefficient": 0.5}, {"heuristic": "idle"}),
+    ("imitation", "bus14-T0", "default", {"labels": ("labels/one", "labels/two"), "acting_weight": 3.0}, {}),
+    ("imitation", "bus14-H0", "default", {"labels": ("labels/one",), "policy": "sac"}, {}),
     ("lagrangian-ppo", "bus14-T0-TLO", "default", {"thresholds": (20.0,), "constraints": ("TLO",)}, {}),
 ]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +78,16 @@ def test_all_algorithms_learn_joint_tasks_with_the_actions_that_they_know():
     assert masked.keys() >= {"ppo", "lagrangian-ppo", "dqn", "sac", "td3", "imitation"}
     assert {name: masked[name] for name in topology} == {**topology, "imitation": False}  # of both parts at once
     assert hyperparameters("td3", "bus14-H0") == hyperparameters("td3", "bus14-R")
+
+
+def test_joint_tasks_are_learned_as_is_asked_for():
+    for name in ("ppo", "sac"):
+        assert hyperparameters(name, "bus14-H0", joint_actions="discrete").mask_actions
+        box = hyperparameters(name, "bus14-H0", joint_actions="box")
+        assert replace(box, joint_actions=None) == hyperparameters(name, "bus14-R")
+    for name, only in (("dqn", "discrete"), ("td3", "box"), ("imitation", "box")):
+        with pytest.raises(UsageError, match=f"joint_actions of {name} .* does not exist: choose one of {only}."):
+            hyperparameters(name, "bus14-H0", joint_actions="box" if only == "discrete" else "discrete")
 
 
 def test_unknown_presets_and_hyperparameters_are_refused():

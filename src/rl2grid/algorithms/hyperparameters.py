@@ -59,6 +59,9 @@ class SharedArgs:
     own."""
     shortlist: int | None = added_later(None)
     """Discrete actions only: among how many it chooses, do nothing and the best-ranked ones; None: all."""
+    joint_actions: str | None = added_later(None)
+    """Joint tasks only: ``discrete`` (a topology action, or one control moved fully) or ``box`` (both parts at once);
+    None: discrete where the algorithm knows such."""
     start_from: str | None = added_later(None)
     """A run folder or checkpoint whose policy the run begins with, on the command line ``--from``; None: a new one."""
     torch_threads: int = 1

@@ -84,13 +84,27 @@ class Algorithm:
         """Whether it can learn tasks of a kind, of :data:`rl2grid.mdp.features.KINDS`."""
         return kind == "H" or kind in self.kinds
 
-    def plays_continuous(self, kind: str) -> bool:
+    def plays_continuous(self, kind: str, joint_actions: str | None = None) -> bool:
         """Whether it learns tasks of a kind with continuous actions.
 
         Joint tasks are learned as :class:`~rl2grid.envs.joint.JointAsDiscrete` by whom discrete actions are learned at
         all, unless :attr:`joint_as_box` says otherwise, else as :class:`~rl2grid.envs.joint.JointAsBox`.
+
+        Args:
+            kind: Of the task.
+            joint_actions: Of joint tasks, ``"discrete"`` or ``"box"``: how they are to be learned; None: as above.
+
+        Raises:
+            UsageError: it cannot learn joint tasks like that.
         """
-        return kind == "R" or (kind == "H" and (self.joint_as_box or "T" not in self.kinds))
+        if kind != "H":
+            return kind == "R"
+        able = {"discrete": "T" in self.kinds and not self.joint_as_box, "box": "R" in self.kinds}
+        if joint_actions is None:
+            return not able["discrete"]
+        if not able.get(joint_actions):
+            raise one_of(f"joint_actions of {self.name}", joint_actions, [way for way in able if able[way]])
+        return joint_actions == "box"
 
     def type_hints(self) -> dict[str, Any]:
         """Type hint of every hyperparameter."""

@@ -75,6 +75,9 @@ class StartingPolicy:
         theirs, mine = self.policy["factory"]["spec"], spec.state_dict()
         for name, words in _WORDS.items():
             if theirs[name] != mine[name]:
+                if name == "continuous" and theirs["task"] is not None:
+                    way = "box" if theirs[name] else "discrete"
+                    raise self.refusal(f"it plays joint actions otherwise: set joint_actions to {way}")
                 raise self.refusal(f"it has {words.format(theirs[name])}, here are {words.format(mine[name])}")
         network = self.policy["factory"]["name"]
         if network != args.network:

@@ -120,8 +120,8 @@ def _begin(algorithm: str, task_id: str, flags: list[str]) -> int:
         from rl2grid.training.validation import find_validator
     except ImportError as error:
         raise UsageError(f"Training needs {error.name}: install it with `pip install rl2grid[train]`.") from None
-    network = _value(flags, "--network")
-    chosen = {} if network is None else {"network": network}
+    deciding = {name: _value(flags, f"--{flag_of(name)}") for name in request.DECIDING}
+    chosen = {name: value for name, value in deciding.items() if value is not None}
     hyperparameters = request.hyperparameters(algorithm, task, _value(flags, "--preset") or "default", **chosen)
     _refuse_unknown(flags, [*fields(TrainFlags), *options_without(*GIVEN_OTHERWISE), *fields(hyperparameters)])
     own, keywords, hyperparameters = _parse_all(f"rl2grid train {algorithm} {task.id}", flags, hyperparameters)

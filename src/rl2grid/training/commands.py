@@ -24,8 +24,10 @@ def train_command(args: request.RunArgs, preset: str = "default", folder: Path |
     """
     words = ["rl2grid", "train", args.algorithm, short_id(args.task.id)]
     words += ["--preset", preset] if preset != "default" else []
-    chosen, original = asdict(args.hyperparameters), asdict(request.hyperparameters(args.algorithm, args.task, preset))
-    changes = {name: value for name, value in chosen.items() if value != original[name]}
+    chosen, usual = asdict(args.hyperparameters), request.hyperparameters(args.algorithm, args.task, preset)
+    deciding = {name: chosen[name] for name in request.DECIDING if chosen.get(name) != getattr(usual, name, None)}
+    original = asdict(request.hyperparameters(args.algorithm, args.task, preset, **deciding))
+    changes = deciding | {name: value for name, value in chosen.items() if value != original[name]}
     words += [*environment_flags(args.env_keywords), *flags(changes)]
     if args.evaluate_every != request.RunArgs.evaluate_every:
         words += ["--evaluate-every", str(args.evaluate_every)]

@@ -24,6 +24,8 @@ from rl2grid.scenarios.library import check_in_split, generator_version, scenari
 from rl2grid.scenarios.splits import TRAIN, VALIDATION, VALIDATION_MONTHS
 from rl2grid.training.tracking import check_tracking
 
+DECIDING = ("network", "joint_actions")
+"""Hyperparameters by which a preset has other values of others."""
 _ACTIONS = {"T": "discrete", "R": "continuous"}
 
 
@@ -76,7 +78,8 @@ def hyperparameters(algorithm: str, task: Task | str, preset: str = "default", *
             raise one_of(f"Hyperparameter of {algorithm}", name, known)
     if "network" in changes and not _reads_normalized(changes["network"]):
         changes = {"normalize_observations": False} | changes
-    resolved: Hyperparameters = chosen.preset(preset, continuous=chosen.plays_continuous(task.kind), **changes)
+    continuous = chosen.plays_continuous(task.kind, changes.get("joint_actions"))
+    resolved: Hyperparameters = chosen.preset(preset, continuous=continuous, **changes)
     return resolved
 
 

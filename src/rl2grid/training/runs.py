@@ -76,7 +76,8 @@ def make_envs(args: RunArgs) -> VectorEnvironment:
     )
     if args.task.kind != "H":
         return cast("VectorEnvironment", envs)
-    continuous = find_algorithm(args.algorithm).plays_continuous("H")
+    asked = getattr(args.hyperparameters, "joint_actions", None)
+    continuous = find_algorithm(args.algorithm).plays_continuous("H", asked)
     return VectorJointAsBox(envs) if continuous else VectorJointAsDiscrete(envs)
 
 
