@@ -59,6 +59,16 @@ def test_what_a_run_lacks_is_told(tmp_path):
     ]
 
 
+def test_a_run_that_played_nothing_has_no_curve(tmp_path):
+    write_made_up_run(tmp_path / "run")
+    metrics = tmp_path / "run" / "metrics.csv"
+    metrics.write_text(metrics.read_text().replace("charts/survival", "validation/survival"))
+    write_made_up_evaluation(tmp_path / "run" / "evaluation" / "validation")
+    collection = collect([str(tmp_path / "run")])
+    assert len(collection.evaluations) == 1
+    assert collection.runs == collection.missing == []
+
+
 def test_a_study_brings_every_finished_cell_under_its_name(tmp_path):
     unfinished = cell("bus14-T0-v0-ppo-idle-3", seed=3, finished=False)
     write_made_up_study(tmp_path, [*map(dict, CELLS), unfinished])

@@ -113,7 +113,7 @@ def _add_folder(collection: Collection, folder: Path, label: str | None, split: 
     collection.evaluations += [_named(load_evaluation(one), label and f"{label} (last)") for one in last]
     if is_run(folder):
         run = read_training_run(folder, label)
-        collection.runs.append(run)
+        _add_run(collection, run)
         if not evaluations:
             collection.missing.append(
                 f"Run {folder} was not evaluated on {split}: rl2grid evaluate {folder} {run.task} --split {split}"
@@ -176,7 +176,13 @@ def _add_cell(collection: Collection, folder: Path, cell: Mapping[str, Any], giv
     collection.evaluations.append(_named(load_evaluation(folder / EVALUATION_FOLDER), label))
     if cell["training"] is not None:
         curve = label if given or not label or not cell["heuristic"] else f"{label} + {cell['heuristic']}"
-        collection.runs.append(read_training_run(folder / RUN_FOLDER, curve))
+        _add_run(collection, read_training_run(folder / RUN_FOLDER, curve))
+
+
+def _add_run(collection: Collection, run: TrainingRun) -> None:
+    """A run has a curve if it plays: who learns from labels has none."""
+    if run.curve.is_of_play:
+        collection.runs.append(run)
 
 
 def _cell_label(cell: Mapping[str, Any]) -> str | None:

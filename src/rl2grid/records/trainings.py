@@ -44,12 +44,17 @@ class TrainingCurve:
     label: str
     """What figures call the run; runs with one label are drawn as one line."""
     metrics: Mapping[str, Metric]
-    """By name, such as :data:`SURVIVAL`, which is always there."""
+    """By name, such as :data:`SURVIVAL`, which whoever learns without playing has not."""
 
     @property
     def survival(self) -> Metric:
         """Of the episodes that ended in training."""
         return self.metrics[SURVIVAL]
+
+    @property
+    def is_of_play(self) -> bool:
+        """Whether episodes ended in training."""
+        return SURVIVAL in self.metrics
 
     @property
     def validation(self) -> Metric | None:
@@ -146,12 +151,13 @@ def _read_decoration(path: Path, what: str, shape: Any) -> Any:
         return None
 
 
-def read_training_curve(path: Path, label: str) -> TrainingCurve:
+def read_training_curve(path: Path, label: str, *, of_play: bool = True) -> TrainingCurve:
     """The curve of a run.
 
     Args:
         path: ``metrics.csv``, or the run folder that holds it.
         label: what figures call the run; runs with one label are drawn as one line.
+        of_play: whether episodes must have ended in training; else a validation is enough.
 
     A last line without its end, as a killed run leaves it, is ignored.
 
@@ -169,7 +175,7 @@ def read_training_curve(path: Path, label: str) -> TrainingCurve:
             f"{path} is no metrics file of a training run: give a run folder or its metrics.csv."
         ) from None
     metrics = _metrics(points)
-    if SURVIVAL not in metrics:
+    if SURVIVAL not in metrics and (of_play or VALIDATION not in metrics):
         raise UsageError(f"{path} has no survival yet: no episode has ended in training.")
     return TrainingCurve(label, metrics)
 
@@ -202,7 +208,7 @@ def read_training_run(folder: Path, label: str | None = None) -> TrainingRun:
     }
     heuristic = keywords.get("heuristic")
     name = label or (f"{algorithm} + {heuristic}" if heuristic else algorithm)
-    return TrainingRun(folder, task, settings, seed, read_training_curve(folder, name))
+    return TrainingRun(folder, task, settings, seed, read_training_curve(folder, name, of_play=False))
 
 
 def group_curves(runs: Sequence[TrainingRun]) -> dict[str, dict[str, tuple[TrainingCurve, ...]]]:
