@@ -61,6 +61,18 @@ def test_it_keeps_to_its_actions():
     assert choose([1.1, 0.5, 0.9, 0.8], actions=[3, 2]) == 3
 
 
+def test_it_tells_the_legal_actions_with_the_lowest_worst_loading():
+    agent = Greedy([1, 2, 3, 4])
+    stage = Stage([1.1, 0.5, 0.9, INF, 0.8], [True, False, True, True, True])
+    agent.bind(stage)
+    agent.act(OBSERVATION, {})
+    assert agent.ranking(2) == ("worst loading", [4, 2], [0.8, 0.9], "")
+    assert agent.ranking(9) == ("worst loading", [4, 2, 0], [0.8, 0.9, 1.1], "")
+    stage.state.rho[0] = 0.5
+    agent.act(OBSERVATION, {})
+    assert agent.ranking(2) is None
+
+
 def test_a_safe_grid_is_left_alone_and_recovery_is_tried_first():
     stage = Stage([0.9] * 209, [True] * 209)
     stage.state.rho[0] = 0.5

@@ -65,6 +65,26 @@ def test_actions_of_every_kind_of_task_are_of_its_space():
         assert not info["ambiguous"]
 
 
+def test_it_tells_the_single_actions_that_a_search_compared():
+    env = environment("bus36-MO-v0-T0")
+    agent, told = Planner(), []
+    agent.bind(env)
+    observation, info = env.reset(seed=3)
+    agent.reset(0)
+    over = False
+    while not over and len(told) < 3:
+        action = agent.act(observation, info)
+        ranking = agent.ranking(4)
+        if ranking is not None:
+            told.append(ranking)
+            assert env.unwrapped.action_masks()[list(ranking.actions)].all()
+            assert sorted(ranking.values) == list(ranking.values)
+            assert len(ranking.actions) <= 4
+        observation, _, terminated, truncated, info = env.step(action)
+        over = terminated or truncated
+    assert told
+
+
 def test_prevention_shifts_power_while_the_grid_is_safe():
     env = environment("bus36-MO-v0-H0", opponent=True)
     play(Planner(), env, steps=60)

@@ -40,6 +40,10 @@ def test_one_action_alone_is_the_best_by_its_score(seed):
     score = score + 3.0 * (rho > env.grid.rules.hard_overflow).any(axis=1)
     assert found.n_actions == 1
     assert np.isclose(score[found.action], np.nanmin(score), atol=1e-5)
+    entries, penalties = zip(*search.singles, strict=True)
+    np.testing.assert_allclose(penalties, score[list(entries)], atol=1e-5)
+    assert sorted(penalties) == list(penalties)
+    assert np.isfinite(penalties).all()
 
 
 def test_a_sequence_is_found_where_no_action_alone_helps():
