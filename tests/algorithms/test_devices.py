@@ -10,15 +10,19 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import test_imitation
 import test_lagrangian_ppo
 import test_off_policy
 import test_ppo
+import test_starting
 import torch
 import toy_grid
+from labelled_toys import write
 from torch import Tensor
 from torch.fx.experimental import _config as shapes
 
@@ -69,6 +73,30 @@ def test_tensors_of_two_devices_never_meet(name: str):
         learned += any(key.startswith("losses/") for key in learner.iterate())
     assert learned, "nothing was learned"
     assert {parameter.device.type for parameter in parameters(learner)} == {"meta"}
+
+
+@pytest.mark.usefixtures("on_meta")
+@pytest.mark.parametrize(("task", "policy"), [("bus14-T0", "ppo"), ("bus14-R", "ppo"), ("bus14-H0", "sac")])
+def test_tensors_of_two_devices_never_meet_in_imitation(tmp_path: Path, task: str, policy: str):
+    folder = write(tmp_path / "labels", task, months=3, n=5)
+    learner = test_imitation.learner(folder, task, policy=policy, num_steps=20, batch_size=8, total_timesteps=40)
+    while not learner.finished:
+        assert "losses/holdout_loss" in learner.iterate()
+    assert {parameter.device.type for parameter in parameters(learner)} == {"meta"}
+
+
+@pytest.mark.filterwarnings("ignore:for .* copying from a non-meta parameter")
+@pytest.mark.parametrize(("algorithm", "task"), [("ppo", "bus14-T0"), ("ppo", "bus14-R"), ("sac", "bus14-T0")])
+def test_tensors_of_two_devices_never_meet_near_a_teacher(
+    tmp_path: Path, request: pytest.FixtureRequest, algorithm: str, task: str
+):
+    path = test_starting.trained(tmp_path / "first.pt", algorithm, task)
+    request.getfixturevalue("on_meta")
+    learner = test_starting.learner(algorithm, task, start_from=path, actor_starts=0)
+    learned: set[str] = set()
+    while not learner.finished and "losses/teacher_kl" not in learned:
+        learned |= learner.iterate().keys()
+    assert "losses/teacher_kl" in learned
 
 
 def parameters(learner: Any) -> list[Tensor]:

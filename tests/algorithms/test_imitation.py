@@ -137,6 +137,17 @@ def test_a_critic_learns_the_scaled_returns(tmp_path: Path):
     assert metrics["losses/explained_variance"] > 0.7
 
 
+def test_networks_that_read_grids_imitate_as_well(tmp_path: Path):
+    folder = write(tmp_path / "labels", "bus14-T0", of_largest_feature, months=2)
+    for network in ("action-embedding", "gnn"):
+        imitation = learner(
+            folder, "bus14-T0", network=network, normalize_observations=False, num_steps=200, total_timesteps=400
+        )
+        first, second = imitation.iterate(), imitation.iterate()
+        assert second["losses/imitation_loss"] < first["losses/imitation_loss"]
+        assert load_policy(imitation.policy_state()).act(torch.zeros(1, imitation.observation_size), None, None) >= 0
+
+
 # --- Resuming -------------------------------------------------------------------------------------------------------
 
 

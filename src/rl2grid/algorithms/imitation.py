@@ -43,6 +43,7 @@ import hashlib
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
@@ -500,14 +501,14 @@ class Imitation(Learner):
         self.begin_as_asked()
         args = self.args
         rates = self._set_learning_rates()
-        history: list[tuple[Errors, Batch, Tensor]] = []
+        history: list[Seen] = []
         for first in range(0, args.num_steps, args.batch_size):
             batch = self.examples.rows(self._next(min(args.batch_size, args.num_steps - first)))
             history.append(self._descend(batch))
         self.iteration += 1
-        metrics = _metrics([(errors, batch) for errors, batch, _ in history], "losses/imitation_loss", "charts/")
+        metrics = _metrics(history, "losses/imitation_loss", "charts/")
         if isinstance(self.network, ActorCritic):
-            metrics["losses/value_loss"] = mean(value for _, _, value in history)
+            metrics["losses/value_loss"] = mean(seen.value_loss for seen in history)
         metrics |= self._held_out_metrics()
         metrics["charts/epochs"] = self.decisions / len(self.examples)
         metrics["charts/learning_rate"] = rates[0]
@@ -515,31 +516,31 @@ class Imitation(Learner):
             metrics["charts/action_std"] = float(self.network.log_std.detach().exp().mean())
         return metrics
 
-    def _descend(self, batch: Batch) -> tuple[Errors, Batch, Tensor]:
+    def _descend(self, batch: Batch) -> Seen:
         errors = errors_of(self.network, batch, self.args)
         losses = errors.policy if errors.deviations is None else errors.policy + errors.deviations
         loss = (batch.weights * losses).mean()
-        value = torch.zeros(())
+        value = torch.zeros_like(loss)
         if isinstance(self.network, ActorCritic):
             value = 0.5 * (batch.weights * (self.network.value(batch.observations) - batch.returns).square()).mean()
-            loss = loss + value.to(loss.device)
+            loss = loss + value
         descend(self.optimizer, loss, self.args.max_grad_norm)
         if isinstance(self.network, ActorCritic) and self.continuous:
             with torch.no_grad():
                 self.network.log_std[-batch.injection.shape[-1] :].clamp_(*self.args.log_std_range)  # type: ignore[union-attr]
-        return Errors(errors.policy.detach(), errors.agrees), batch, value.detach()
+        return seen_of(errors, batch, value)
 
     def _held_out_metrics(self) -> dict[str, float]:
         """How well the policy does on months that it does not learn from; nothing without such."""
         if not len(self.aside):
             return {}
         with torch.no_grad():
-            batches = list(self.aside.batches(4096))
-            errors = [(errors_of(self.network, batch, self.args), batch) for batch in batches]
-            metrics = _metrics(errors, "losses/holdout_loss", "charts/holdout_")
+            batches = partial(self.aside.batches, self.args.batch_size)
+            seen = [seen_of(errors_of(self.network, batch, self.args), batch) for batch in batches()]
+            metrics = _metrics(seen, "losses/holdout_loss", "charts/holdout_")
             if isinstance(self.network, ActorCritic):
-                values = torch.cat([self.network.value(batch.observations) for batch in batches])
-                returns = torch.cat([batch.returns for batch in batches])
+                values = torch.cat([self.network.value(batch.observations) for batch in batches()])
+                returns = torch.cat([batch.returns for batch in batches()])
                 metrics["losses/explained_variance"] = explained_variance(values, returns)
         return metrics
 
@@ -614,12 +615,28 @@ def weighted_statistics(observations: F32, weights: F32) -> dict[str, Any]:
     return {"count": count, "mean": average, "squares": squares * (count / total)}
 
 
-def _metrics(seen: Sequence[tuple[Errors, Batch]], loss: str, agreement: str) -> dict[str, float]:
+class Seen(NamedTuple):
+    """What metrics need to know of a batch, each [batch] but the last; nothing that is as large as its masks."""
+
+    losses: Tensor
+    """weighted"""
+    agrees: Tensor
+    acts: Tensor
+    stands_for: Tensor
+    value_loss: Tensor
+
+
+def seen_of(errors: Errors, batch: Batch, value_loss: Tensor | None = None) -> Seen:
+    """What is kept of the errors of a batch."""
+    losses = (batch.weights * errors.policy).detach()
+    value = torch.zeros_like(losses[:1].sum()) if value_loss is None else value_loss.detach()
+    return Seen(losses, errors.agrees, batch.acts, batch.stands_for, value)
+
+
+def _metrics(seen: Sequence[Seen], loss: str, agreement: str) -> dict[str, float]:
     """Means over decisions: the loss as it is minimised, and how often the most probable action is the teacher's."""
-    losses = torch.cat([batch.weights * errors.policy for errors, batch in seen])
-    agrees = torch.cat([errors.agrees for errors, _ in seen])
-    acts = torch.cat([batch.acts for _, batch in seen])
-    counts = torch.cat([batch.stands_for for _, batch in seen])
+    losses, agrees = torch.cat([each.losses for each in seen]), torch.cat([each.agrees for each in seen])
+    acts, counts = torch.cat([each.acts for each in seen]), torch.cat([each.stands_for for each in seen])
     metrics = {loss: float(losses.mean()), f"{agreement}agreement": float((counts * agrees).sum() / counts.sum())}
     if acts.any():
         metrics[f"{agreement}agreement_acting"] = float((counts * agrees)[acts].sum() / counts[acts].sum())
