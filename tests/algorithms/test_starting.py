@@ -136,6 +136,15 @@ def test_dqn_goes_on_with_its_own_values(tmp_path: Path):
     assert_same(dict(mine.target.state_dict()), dict(theirs))
 
 
+def test_every_seed_may_begin_with_a_policy_of_its_own(tmp_path: Path):
+    trained(tmp_path / "first-5.pt", "ppo")
+    mine = learner("ppo", "bus14-T0", start_from=str(tmp_path / "first-{seed}.pt"))
+    mine.begin_as_asked()
+    assert mine.identity()["start"]["path"] == str(tmp_path / "first-5.pt")
+    with pytest.raises(UsageError, match="first-6"):
+        learner("ppo", "bus14-T0", start_from=str(tmp_path / "first-{seed}.pt"), seed=6).begin_as_asked()
+
+
 # --- Near the teacher -----------------------------------------------------------------------------------------------
 
 

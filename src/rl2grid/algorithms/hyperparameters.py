@@ -63,11 +63,16 @@ class SharedArgs:
     """Joint tasks only: ``discrete`` (a topology action, or one control moved fully) or ``box`` (both parts at once);
     None: discrete where the algorithm knows such."""
     start_from: str | None = added_later(None)
-    """A run folder or checkpoint whose policy the run begins with, on the command line ``--from``; None: a new one."""
+    """A run folder or checkpoint whose policy the run begins with, on the command line ``--from``; ``{seed}`` in it is
+    the run's seed. None: a new policy."""
     torch_threads: int = 1
     """Threads of PyTorch; results are reproducible bit by bit for a given number only."""
     device: str = "cpu"
     """Where the networks are: ``cpu``, ``cuda``, or ``auto`` (``cuda`` if there is one)."""
+
+    def with_seed(self, path: str) -> str:
+        """A path in which ``{seed}`` stands for the seed of the run."""
+        return path.replace("{seed}", str(self.seed))
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work.

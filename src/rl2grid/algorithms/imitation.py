@@ -88,7 +88,7 @@ class Args(SharedArgs):
     algorithm: ClassVar[str] = "Imitation"
 
     labels: tuple[str, ...] = ()
-    """Folders of labels that 'rl2grid teach' wrote, of one task; at least one."""
+    """Folders of labels that 'rl2grid teach' wrote, of one task; at least one. ``{seed}`` in them is the run's seed."""
     policy: str = ON_POLICY
     """Whose policy is learned: ``ppo``, with a critic, or ``sac``."""
     total_timesteps: int = 2_000_000
@@ -587,7 +587,7 @@ def _labels_for(args: Args, spec: Spec, options: Any) -> tuple[LabelsDescription
         raise UsageError("Imitation needs labels: give a folder that 'rl2grid teach' wrote, with --labels.")
     if spec.task is None:
         raise UsageError("Imitation learns tasks of rl2grid, whose observations and actions labels can name.")
-    description, labels = read_labels([Path(folder) for folder in args.labels], spec.task)
+    description, labels = read_labels([Path(args.with_seed(folder)) for folder in args.labels], spec.task)
     for name in ("heuristic", "normalize", "reward"):
         mine, theirs = getattr(options, name), description.env_keywords.get(name)
         if mine != theirs:

@@ -154,7 +154,7 @@ class Learner(ABC):
             UsageError: there is no policy there, or none that this learner can begin with.
         """
         if self.args.start_from is not None and self.start is None:
-            self.begin_with(read_starting_policy(self.args.start_from, self.spec.task))
+            self.begin_with(read_starting_policy(self.args.with_seed(self.args.start_from), self.spec.task))
 
     def begin_with(self, start: StartingPolicy) -> None:
         """Take over the weights of a policy, and for good the statistics by which it reads observations.
