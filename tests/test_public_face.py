@@ -84,3 +84,11 @@ def test_a_training_is_a_run_that_comes_back_and_is_evaluated(tmp_path: Path):
         rl2grid.train("qpo", "bus14-T0")
     with pytest.raises(UsageError, match="sizes"):
         rl2grid.train("ppo", "bus14-T0", hyperparameters={"sizes": 3})
+
+
+def test_a_training_begins_where_it_is_told_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    asked: list[RunArgs] = []
+    monkeypatch.setattr("rl2grid.training.runs.train", lambda args, **_: asked.append(args))
+    rl2grid.train("ppo", "bus14-T0", start_from=tmp_path / "first", hyperparameters={"seed": 3}, validation_months=0)
+    rl2grid.train("ppo", "bus14-T0", validation_months=0)
+    assert [args.hyperparameters.start_from for args in asked] == [str(tmp_path / "first"), None]  # type: ignore[attr-defined]
