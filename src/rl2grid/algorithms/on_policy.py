@@ -551,7 +551,7 @@ class OnPolicyTrainer(Trainer):
         """Let the step sizes follow their schedule; those of the actor and of the critics."""
         remaining = 1.0 - self.iteration / self.num_iterations if self.args.anneal_learning_rate else 1.0
         rates = (remaining * self.args.actor_learning_rate, remaining * self.args.critic_learning_rate)
-        if self.decisions <= (self.args.actor_starts or 0):
+        if 0 < self.decisions <= (self.args.actor_starts or 0):
             rates = (0.0, rates[1])
         actor, *critics = self.optimizer.param_groups
         actor["lr"] = rates[0]
