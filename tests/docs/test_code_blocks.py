@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from documentation import PAGES, blocks, name_of
 
+from rl2grid.algorithms.pretrained import cards
 from rl2grid.cli import main as command_line
 from rl2grid.envs.tasks import find_task
 from rl2grid.evaluation.agents import AGENTS
@@ -68,7 +69,8 @@ def test_commands_exist_with_their_flags(block, line, monkeypatch):
     if hasattr(options, "task"):
         find_task(options.task)
     if getattr(options, "agent", None) is not None:
-        assert options.agent in AGENTS or options.agent.startswith(("runs/", "examples/"))
+        named = (*AGENTS, *(f"pretrained/{card.name}" for card in cards()))
+        assert options.agent in named or options.agent.startswith(("runs/", "examples/"))
 
 
 @pytest.mark.slow
