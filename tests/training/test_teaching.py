@@ -16,12 +16,14 @@ from rl2grid.agents.do_nothing import DoNothing
 from rl2grid.agents.planner import Planner
 from rl2grid.agents.random_agent import RandomAgent
 from rl2grid.envs.grid_env import PowerGridEnv
+from rl2grid.envs.tasks import find_task
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.crew import Job
 from rl2grid.records.labels import LABELS_FILE, Labels, is_labels, month_path, read_labels
 from rl2grid.scenarios.splits import TRAINING_SEEDS
 from rl2grid.training import teaching
 from rl2grid.training.labeller import returns_of
+from rl2grid.training.request import hyperparameters
 from rl2grid.training.teaching import DISCOUNTS, summary_of, teach
 
 SHORT: dict[str, Any] = {"months": 2, "workers": 0, "episode_length": 25}
@@ -316,10 +318,6 @@ def test_a_pupil_of_other_environments_is_refused(tmp_path: Path):
         teach("do-nothing", "bus14-T0", output=tmp_path / "labels", pupil=pupil, heuristic=None, **SHORT)
 
 
-def test_the_discounts_are_those_of_ppo():
-    pytest.importorskip("torch")
-    from rl2grid.training.request import hyperparameters
-
-    for kind, discount in DISCOUNTS.items():
-        task = f"bus14-{kind}" if kind == "R" else f"bus14-{kind}0"
-        assert hyperparameters("ppo", task).gamma == discount
+@pytest.mark.parametrize("task", ["bus14-T0", "bus14-R", "bus14-H0"])
+def test_labels_have_the_discount_with_which_imitation_learns_them(task: str):
+    assert hyperparameters("imitation", task).gamma == DISCOUNTS[find_task(task).kind]

@@ -36,7 +36,10 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         "--pupil-share", type=float, default=PUPIL_SHARE, help="probability with which the pupil acts, else the teacher"
     )
     parser.add_argument(
-        "--gamma", type=float, default=None, help="discount of a grid step; by default 0.9, on redispatching tasks 0.99"
+        "--gamma",
+        type=float,
+        default=None,
+        help="discount of a grid step; by default 0.9, of injections 0.99",
     )
     parser.add_argument(
         "--thin",

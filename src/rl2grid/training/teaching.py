@@ -39,8 +39,9 @@ MONTHS, PUPIL_SHARE, THIN = 20, 1.0, 10.0
 """Of a round, unless others are asked for."""
 CANDIDATES = 8
 """Topology actions of which a teacher that compares them says what it thinks."""
-DISCOUNTS = {"T": 0.9, "R": 0.99, "H": 0.9}
-"""Of a grid step by kind of task, unless another one is asked for: those of the preset ``default`` of PPO."""
+DISCOUNTS = {"T": 0.9, "R": 0.99, "H": 0.99}
+"""Of a grid step by kind of task, unless another one is asked for: those of the preset ``default`` of imitation, which
+learns joint actions as continuous ones."""
 _ROUND = 2**20
 """Episodes of a round in the stream of a seed; more than months that it may have."""
 _MOST_SEEDS = 2**31
