@@ -38,7 +38,6 @@ from torch import Tensor, nn
 from rl2grid.algorithms.hyperparameters import changed_preset
 from rl2grid.algorithms.networks import NetworkFactory, Output
 from rl2grid.algorithms.off_policy import (
-    ILLEGAL,
     Batch,
     OffPolicyArgs,
     OffPolicyTrainer,
@@ -46,6 +45,7 @@ from rl2grid.algorithms.off_policy import (
     random_legal_actions,
 )
 from rl2grid.algorithms.registry import Algorithm
+from rl2grid.algorithms.sampling import NEVER
 from rl2grid.algorithms.starting import StartingPolicy
 from rl2grid.errors import UsageError, one_of
 
@@ -213,13 +213,13 @@ class QNetwork(nn.Module):
     def preferences(self, observations: Tensor, masks: Tensor | None) -> Tensor:
         """Values of the actions, [batch, actions]; of illegal ones large and negative."""
         values: Tensor = self(observations)
-        return values if masks is None else values.masked_fill(~masks, ILLEGAL)
+        return values if masks is None else values.masked_fill(~masks, NEVER)
 
 
 def best_actions(values: Tensor, masks: Tensor | None) -> Tensor:
     """The legal action of the highest value, int64 [batch], of values and masks [batch, actions]."""
     if masks is not None:
-        values = values.masked_fill(~masks, ILLEGAL)
+        values = values.masked_fill(~masks, NEVER)
     return values.argmax(dim=-1)
 
 

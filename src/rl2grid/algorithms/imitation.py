@@ -61,6 +61,7 @@ from rl2grid.algorithms.on_policy import ActorCritic
 from rl2grid.algorithms.playing import check_environments
 from rl2grid.algorithms.registry import Algorithm
 from rl2grid.algorithms.sac import CategoricalActor, GaussianActor
+from rl2grid.algorithms.sampling import NEVER, legal_log_softmax
 from rl2grid.algorithms.trainer import Learner
 from rl2grid.arrays import F32, I64, Flags
 from rl2grid.envs.spec import Spec, spec_of
@@ -309,7 +310,7 @@ def aims(batch: Batch, masks: Tensor | None, actions: int, args: Args) -> Tensor
     aim = hard
     known = batch.candidates != NO_CANDIDATE
     if args.soft_share and known.shape[1]:
-        values = (batch.values / args.soft_temperature).masked_fill(~known, on_policy.ILLEGAL_LOGIT)
+        values = (batch.values / args.soft_temperature).masked_fill(~known, NEVER)
         liked = values.softmax(dim=-1) * known
         soft = torch.zeros_like(hard).scatter_add_(-1, batch.candidates.clamp(min=0), liked)
         share = args.soft_share * known.any(dim=-1, keepdim=True)
@@ -322,7 +323,7 @@ def aims(batch: Batch, masks: Tensor | None, actions: int, args: Args) -> Tensor
 
 def cross_entropies(logits: Tensor, aim: Tensor, masks: Tensor | None) -> Tensor:
     """- sum over actions of q log pi, [batch], of logits and q [batch, actions]."""
-    return -(aim * on_policy.legal_log_softmax(logits, masks)).sum(dim=-1)
+    return -(aim * legal_log_softmax(logits, masks)).sum(dim=-1)
 
 
 def huber(errors: Tensor, delta: float) -> Tensor:
@@ -380,7 +381,7 @@ def errors_of(network: nn.Module, batch: Batch, args: Args) -> Errors:
         assert batch.topology is not None
         masks = batch.masks if args.mask_actions else None
         losses = cross_entropies(said.outputs, aims(batch, masks, said.outputs.shape[-1], args), masks)
-        best = said.outputs if masks is None else said.outputs.masked_fill(~masks, on_policy.ILLEGAL_LOGIT)
+        best = said.outputs if masks is None else said.outputs.masked_fill(~masks, NEVER)
         return Errors(losses, best.argmax(dim=-1) == batch.topology)
     return _continuous_errors(network, said, batch, args)
 

@@ -84,9 +84,6 @@ class OffPolicyArgs(SharedArgs):
 
 # --- Networks -------------------------------------------------------------------------------------------------------
 
-ILLEGAL = -1e8
-"""Value or logit of an illegal action: never the largest, probability exactly zero in float32, and finite."""
-
 
 class TwinCritics(nn.Module):
     """Two values of a continuous action, learned independently."""

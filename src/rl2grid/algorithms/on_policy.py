@@ -45,9 +45,9 @@ from rl2grid.algorithms.descent import Adam, descend
 from rl2grid.algorithms.diagnostics import mean
 from rl2grid.algorithms.networks import PER_ACTION, VALUE, NetworkFactory, orthogonal
 from rl2grid.algorithms.playing import Tally
-from rl2grid.algorithms.sampling import drawn
+from rl2grid.algorithms.sampling import drawn, legal_log_softmax
 from rl2grid.algorithms.starting import StartingPolicy
-from rl2grid.algorithms.teacher import TeacherArgs, categorical_divergences, gaussian_divergences
+from rl2grid.algorithms.teacher import TeacherArgs, divergences
 from rl2grid.algorithms.trainer import Played, Trainer
 
 # --- Hyperparameters ------------------------------------------------------------------------------------------------
@@ -95,9 +95,6 @@ class OnPolicyArgs(TeacherArgs):
 
 
 # --- Networks -------------------------------------------------------------------------------------------------------
-
-ILLEGAL_LOGIT = -1e8
-"""Probability exactly zero in float32, and yet finite, so that zero times its logarithm is zero."""
 
 
 class ActorCritic(nn.Module):
@@ -195,20 +192,6 @@ class ActorCritic(nn.Module):
         deviations = (actions - means) / self.log_std.exp()
         log_densities = -0.5 * deviations.square() - self.log_std - 0.5 * math.log(2 * math.pi)
         return log_densities.sum(dim=-1)
-
-
-def legal_log_softmax(logits: Tensor, masks: Tensor | None) -> Tensor:
-    """Log-probabilities [batch, actions] of logits and legal actions of the same shape; illegal: large and negative."""
-    if masks is not None:
-        logits = logits.masked_fill(~masks, ILLEGAL_LOGIT)
-    return logits.log_softmax(dim=-1)
-
-
-def divergences(teacher: tuple[Tensor, ...], pupil: tuple[Tensor, ...]) -> Tensor:
-    """KL(teacher || pupil) [batch] of what :meth:`ActorCritic.distribution` says."""
-    if len(teacher) == 1:
-        return categorical_divergences(*teacher, *pupil)
-    return gaussian_divergences((teacher[0], teacher[1]), (pupil[0], pupil[1]))
 
 
 def load_policy(state: Mapping[str, Any]) -> ActorCritic:

@@ -132,7 +132,7 @@ class PolicyAgent:
     def best(self, observation: Observation, k: int) -> tuple[list[Action], list[float]]:
         """The ``k`` legal discrete actions that it prefers, the best first, and its preferences; fewer if there are."""
         observations, masks = self._seen = self._inputs(observation)
-        legal = torch.as_tensor(self._env.action_masks())
+        legal = torch.as_tensor(self._env.action_masks()) if masks is None else masks[0]
         with torch.no_grad():
             values = self._network.preferences(observations, masks)[0]
         chosen = values.masked_fill(~legal, -torch.inf).topk(min(k, int(legal.sum())))

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from rl2grid.errors import one_of
+from rl2grid.records.statistics import Estimate
 
 PREFIX = "pretrained/"
 LARGEST = 1_000_000
@@ -32,6 +33,11 @@ class Survival:
     high: float
     completed: float
     """Share of the months that were completed."""
+
+    @property
+    def estimate(self) -> Estimate:
+        """The survival with its interval."""
+        return Estimate(self.survival, self.low, self.high)
 
 
 @dataclass(frozen=True)

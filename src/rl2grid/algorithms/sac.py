@@ -47,7 +47,6 @@ from torch import Tensor, nn
 from rl2grid.algorithms.hyperparameters import changed_preset
 from rl2grid.algorithms.networks import PER_ACTION, NetworkFactory, Output
 from rl2grid.algorithms.off_policy import (
-    ILLEGAL,
     Batch,
     OffPolicyArgs,
     OffPolicyTrainer,
@@ -57,9 +56,9 @@ from rl2grid.algorithms.off_policy import (
     random_legal_actions,
 )
 from rl2grid.algorithms.registry import Algorithm
-from rl2grid.algorithms.sampling import drawn
+from rl2grid.algorithms.sampling import drawn, legal_log_softmax
 from rl2grid.algorithms.starting import StartingPolicy
-from rl2grid.algorithms.teacher import TeacherArgs, categorical_divergences, gaussian_divergences
+from rl2grid.algorithms.teacher import TeacherArgs, divergences
 
 # --- Hyperparameters ------------------------------------------------------------------------------------------------
 
@@ -207,6 +206,11 @@ class GaussianActor(nn.Module):
         low, high = _LOG_STD_RANGE
         return means, low + 0.5 * (high - low) * (outputs.tanh() + 1.0)
 
+    def distribution(self, observations: Tensor, masks: Tensor | None) -> tuple[Tensor, ...]:
+        """Means and log deviations of u, each [batch, dimensions]; there is nothing to mask."""
+        means, log_stds = self(observations)
+        return means, log_stds
+
     def sample(self, observations: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
         """Actions [batch, dimensions] in [-1, 1] and their log-densities [batch], from standard normal noise."""
         means, log_stds = self(observations)
@@ -246,11 +250,7 @@ class CategoricalActor(nn.Module):
 
     def forward(self, observations: Tensor, masks: Tensor | None) -> Tensor:
         """Log-probabilities [batch, actions], of illegal actions large and negative."""
-        logits = self.network(observations)
-        if masks is not None:
-            logits = logits.masked_fill(~masks, ILLEGAL)
-        log_probabilities: Tensor = logits.log_softmax(dim=-1)
-        return log_probabilities
+        return legal_log_softmax(self.network(observations), masks)
 
     def act(self, observations: Tensor, masks: Tensor | None, generator: torch.Generator | None) -> Tensor:
         """Actions for observations [batch, size], int64 [batch]; the most probable ones without a generator."""
@@ -259,6 +259,10 @@ class CategoricalActor(nn.Module):
             best: Tensor = log_probabilities.argmax(dim=-1)
             return best
         return drawn(log_probabilities.exp(), generator)
+
+    def distribution(self, observations: Tensor, masks: Tensor | None) -> tuple[Tensor, ...]:
+        """Log-probabilities [batch, actions]."""
+        return (self(observations, masks),)
 
     def preferences(self, observations: Tensor, masks: Tensor | None) -> Tensor:
         """Probabilities of the actions, [batch, actions]."""
@@ -496,15 +500,11 @@ class SAC(OffPolicyTrainer):
         self._descend(self.temperature_optimizer, loss)
         return {**metrics, "losses/alpha_loss": loss, "losses/target_entropy": aims.mean()}
 
-    def _divergences(self, teacher: nn.Module, batch: Batch) -> Tensor:
+    def _divergences(self, teacher: GaussianActor | CategoricalActor, batch: Batch) -> Tensor:
         """KL(teacher || policy) in every state of the batch [batch]."""
-        if self.continuous:
-            with torch.no_grad():
-                said = teacher(batch.observations)
-            return gaussian_divergences(said, self.actor(batch.observations))
         with torch.no_grad():
-            said = teacher(batch.observations, batch.masks)
-        return categorical_divergences(said, self.actor(batch.observations, batch.masks))
+            said = teacher.distribution(batch.observations, batch.masks)
+        return divergences(said, self.actor.distribution(batch.observations, batch.masks))
 
     def _noise(self, batch: Batch) -> Tensor:
         """Standard normal numbers [batch, dimensions]; none for discrete actions."""

@@ -1,9 +1,20 @@
-"""Draws of discrete actions."""
+"""Draws and log-probabilities of discrete actions."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
+
+NEVER = -1e8
+"""Logit or value of an action that may not be played: never the largest, probability exactly zero in float32, and yet
+finite, so that zero times its logarithm is zero."""
+
+
+def legal_log_softmax(logits: Tensor, masks: Tensor | None) -> Tensor:
+    """Log-probabilities [batch, actions] of logits and legal actions of the same shape; illegal: large and negative."""
+    if masks is not None:
+        logits = logits.masked_fill(~masks, NEVER)
+    return logits.log_softmax(dim=-1)
 
 
 def drawn(weights: Tensor, generator: torch.Generator) -> Tensor:

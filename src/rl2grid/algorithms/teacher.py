@@ -48,6 +48,13 @@ class TeacherArgs(SharedArgs):
         return first * max(1.0 - decisions / span, 0.0) if span else 0.0
 
 
+def divergences(teacher: tuple[Tensor, ...], pupil: tuple[Tensor, ...]) -> Tensor:
+    """KL(teacher || pupil) [batch] of log-probabilities alone, or of means and log standard deviations."""
+    if len(teacher) == 1:
+        return categorical_divergences(*teacher, *pupil)
+    return gaussian_divergences((teacher[0], teacher[1]), (pupil[0], pupil[1]))
+
+
 def categorical_divergences(teacher: Tensor, pupil: Tensor) -> Tensor:
     """KL(teacher || pupil) of log-probabilities [batch, actions], [batch]; illegal actions have one that is finite."""
     return (teacher.exp() * (teacher - pupil)).sum(dim=-1)

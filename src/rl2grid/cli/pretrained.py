@@ -7,7 +7,7 @@ from dataclasses import asdict
 from typing import Any
 
 from rl2grid.algorithms.pretrained import PREFIX, ModelCard, cards, pretrained
-from rl2grid.analysis.table import Cell, Column, ResultTable
+from rl2grid.analysis.table import Cell, Column, ResultTable, with_interval
 from rl2grid.cli.output import Output
 
 _COLUMNS = (
@@ -45,8 +45,8 @@ def _tell(card: ModelCard, output: Output) -> int:
     output.text("On validation months that nothing was chosen by:")
     for each in card.validation:
         output.text(
-            f"  {each.agent}: survival {each.survival:.3f} [{each.low:.3f}, {each.high:.3f}], "
-            f"{each.completed:.0%} completed, {each.months} months"
+            f"  {each.agent}: survival {with_interval(each.estimate, 3)}, {each.completed:.0%} completed, "
+            f"{each.months} months"
         )
     output.text("Made by:")
     for command in card.commands:
@@ -61,7 +61,7 @@ def _record(card: ModelCard) -> dict[str, Any]:
 
 def _cells(card: ModelCard) -> tuple[str, ...]:
     own = card.validation[0]
-    survival = f"{own.survival:.3f} [{own.low:.3f}, {own.high:.3f}]"
+    survival = with_interval(own.estimate, 3)
     heuristic = card.heuristic or "none"
     return (PREFIX + card.name, card.task, heuristic, card.algorithm, survival, str(own.months), str(_size(card)))
 

@@ -23,6 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from rl2grid.algorithms.sampling import NEVER
 from rl2grid.arrays import I64
 from rl2grid.envs.spec import JointActions, Spec, spec_from_state
 from rl2grid.errors import UsageError, one_of
@@ -180,10 +181,6 @@ def find_network(name: str) -> Network:
     return network
 
 
-NEVER = -1e8
-"""Logit or value of an action that is not on the shortlist: probability exactly zero in float32, and yet finite."""
-
-
 def shortlist(spec: Spec, size: int) -> I64:
     """The actions among which a policy with a shortlist chooses, ascending int64 [action].
 
@@ -266,13 +263,12 @@ class NetworkFactory:
             style: Activation and first weights.
             do_nothing: Probability of action 0 in every state, if the numbers are logits and the others about alike.
         """
-        first = None
+        first, chosen = None, self.shortlisted()
         if do_nothing is not None:
-            chosen = self.shortlisted()
             others = (self.spec.action_size if chosen is None else len(chosen)) - 1
             first = math.log(do_nothing / (1.0 - do_nothing) * max(others, 1))
         request = Request(self.spec, output, tuple(layers), style, first, self.generator)
-        build, chosen = find_network(self.name).build, self.shortlisted()
+        build = find_network(self.name).build
         return build(request) if chosen is None or not output.per_action else _Shortlisted(request, chosen, build)
 
     def shortlisted(self) -> I64 | None:

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from rl2grid.algorithms.networks import Network, Output, Request
-from rl2grid.algorithms.networks.action_table import KINDS, Places, action_table, first_table
+from rl2grid.algorithms.networks.action_table import KINDS, Places, action_table, first_table, with_first
 from rl2grid.algorithms.networks.mlp import Layers
 
 WIDTH = 64
@@ -90,13 +90,8 @@ class _Scores(nn.Module):
             of_action = self.of_action(embedded)  # [action, number]
             for number, pair in enumerate(self.of_pair):
                 scores = pair(query) @ embedded.T + of_action[:, number]
-                numbers.append(_with_first(scores, self.do_nothing) if number == 0 else scores)
+                numbers.append(with_first(scores, self.do_nothing) if number == 0 else scores)
         return torch.cat(numbers, dim=-1)
-
-
-def _with_first(scores: Tensor, added: Tensor) -> Tensor:
-    """Scores [batch, action] with something added to those of action 0."""
-    return torch.cat([scores[:, :1] + added, scores[:, 1:]], dim=-1)
 
 
 def _needs_actions(output: Output) -> bool:

@@ -112,6 +112,11 @@ def first_table(rows: int, width: int, request: Request) -> Tensor:
     return torch.randn(rows, width, generator=request.generator) / math.sqrt(width)
 
 
+def with_first(scores: Tensor, added: Tensor) -> Tensor:
+    """Scores [batch, action, ...] with something added to those of action 0."""
+    return torch.cat([scores[:, :1] + added, scores[:, 1:]], dim=1)
+
+
 def element_order(grid: Grid) -> I64:
     """int64 [element of ``topo_vect``]: its number in the order of this module."""
     places = (

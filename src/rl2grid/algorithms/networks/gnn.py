@@ -30,7 +30,15 @@ import torch
 from torch import Tensor, nn
 
 from rl2grid.algorithms.networks import Network, Request
-from rl2grid.algorithms.networks.action_table import CONTROLS, KINDS, ActionTable, Places, action_table, first_table
+from rl2grid.algorithms.networks.action_table import (
+    CONTROLS,
+    KINDS,
+    ActionTable,
+    Places,
+    action_table,
+    first_table,
+    with_first,
+)
 from rl2grid.arrays import I32
 from rl2grid.envs.spec import Spec
 from rl2grid.envs.tasks import find_task
@@ -42,16 +50,6 @@ _STRESSED = 0.9
 """Loading from which a line's loading counts once more, five times as much."""
 _SHARE, _LEAST_WIDTH = 16, 8
 """A hidden layer of n numbers stands for a round of messages of n / 16 numbers."""
-_DISPATCH = (
-    "target_dispatch",
-    "actual_dispatch",
-    "gen_margin_up",
-    "gen_margin_down",
-    "gen_p_before_curtail",
-    "curtailment",
-    "curtailment_limit",
-)
-_STORAGE = ("storage_charge", "storage_power_target", "storage_power", "storage_theta")
 
 
 class _Elements(NamedTuple):
@@ -83,7 +81,9 @@ class Features(nn.Module):
         self.observed = spec.observation_size
         self.is_physical = spec.normalize == "physical"
         self.has_topology = "topo_vect" in self.slices
-        self.injects = "target_dispatch" in self.slices
+        of_gens = [feature.name for feature in spec.features if feature.of == "gen"]
+        self.dispatch = [name for name in of_gens if name not in ("gen_p", "gen_theta")]
+        self.of_storage = [feature.name for feature in spec.features if feature.of == "storage"]
         self.reads_action = reads_action
         shift, scale = physical_scale(grid, find_task(spec.task).kind)
         ends = (grid.line_or_pos_topo_vect, grid.line_ex_pos_topo_vect)
@@ -115,8 +115,8 @@ class Features(nn.Module):
 
     def sizes(self) -> tuple[int, int, int, int]:
         """Features of a line, a generator, a load and a storage unit."""
-        gen = 4 + (len(_DISPATCH) if self.injects else 0) + (2 if self.reads_action else 0)
-        return 9, gen, 3, len(_STORAGE) + int(self.reads_action)
+        gen = 4 + len(self.dispatch) + (2 if self.reads_action else 0)
+        return 9, gen, 3, len(self.of_storage) + int(self.reads_action)
 
     def forward(self, inputs: Tensor) -> _Elements:
         """Observations [batch, observation_size], each followed by its action where one is read."""
@@ -167,12 +167,12 @@ class Features(nn.Module):
     def _gens(self, part: dict[str, Tensor], inputs: Tensor) -> Tensor:
         gen_p = part["gen_p"]
         columns = [gen_p, gen_p * self.gen_size, part["gen_theta"], self.renewable.expand_as(gen_p)]
-        columns += [part[name] for name in _DISPATCH] if self.injects else []
+        columns += [part[name] for name in self.dispatch]
         columns += [self._entries(inputs, kind, gen_p) for kind in (0, 1)] if self.reads_action else []
         return torch.stack(columns)
 
     def _storages(self, part: dict[str, Tensor], inputs: Tensor) -> Tensor:
-        columns = [part[name] for name in _STORAGE]
+        columns = [part[name] for name in self.of_storage]
         columns += [self._entries(inputs, 2, columns[0])] if self.reads_action else []
         return torch.stack(columns)
 
@@ -375,7 +375,7 @@ class _Scores(nn.Module):
         if len(self.elements):
             hidden.add_(self._moved(states.lines, states.units, states.elements.second))
         scores: Tensor = self.of_action(hidden.relu_()).flatten(0, 1).T
-        return torch.cat([scores[:, :1] + self.do_nothing, scores[:, 1:]], dim=-1)
+        return with_first(scores, self.do_nothing)
 
     def _places(self, busbars: Tensor, states: _States) -> Tensor:
         """States of what actions change, [width, place, batch]."""
