@@ -1,6 +1,6 @@
 """Random steps without end: environments as users make them, and what must hold of every step.
 
-``python benchmarks/fuzz.py [--steps 1000000] [--grids ...] [--kinds T R]`` plays so many grid steps per grid and kind
+``python benchmarks/fuzz.py [--steps 1000000] [--grids ...] [--kinds T R H]`` plays so many grid steps per grid and kind
 of action, a quarter with each heuristic, and writes ``benchmarks/results/fuzz.json``. Half of the environments play
 legal actions, the others whatever the space has; now and then an environment is saved, played on and brought back, and
 must play the same again. Whatever breaks a rule of :func:`broken_rules`, raises an exception or is another step after
@@ -32,7 +32,7 @@ from rl2grid.records.files import write_json
 
 RESULTS = Path(__file__).resolve().parent / "results" / "fuzz.json"
 NUM_ENVS = 32
-KINDS = ("T", "R")
+KINDS = ("T", "R", "H")
 SETTINGS: tuple[dict[str, Any], ...] = (
     {"heuristic": None, "split": "train", "gamma": 0.99},
     {"heuristic": "idle", "split": "bundled", "normalize": None, "reward": "paper"},
@@ -85,21 +85,33 @@ class Sums:
 
 def task_id(grid: str, kind: str) -> str:
     """The task of a kind with the most actions."""
-    level = len(load_grid(grid).level_sizes) - 1
-    return f"rl2grid/{grid}-{'R' if kind == 'R' else f'T{level}'}-v0"
+    level = "" if kind == "R" else len(load_grid(grid).level_sizes) - 1
+    return f"rl2grid/{grid}-{kind}{level}-v0"
 
 
-def actions_of(envs: Any, draws: np.random.Generator) -> NDArray[Any]:
+def actions_of(envs: Any, draws: np.random.Generator) -> Any:
+    """Actions of all environments as the vector takes them."""
+    space = envs.single_action_space
+    if isinstance(space, gymnasium.spaces.Discrete):
+        return topology_of(envs, int(space.n), draws)
+    if isinstance(space, gymnasium.spaces.Dict):
+        topology = topology_of(envs, int(space["topology"].n), draws)
+        return {"topology": topology, "injection": injection_of((envs.num_envs, *space["injection"].shape), draws)}
+    return injection_of(envs.action_space.shape, draws)
+
+
+def topology_of(envs: Any, n_actions: int, draws: np.random.Generator) -> NDArray[np.int64]:
     """Legal actions for the first half of the environments, any for the others."""
-    if isinstance(envs.single_action_space, gymnasium.spaces.Discrete):
-        n_actions = int(envs.single_action_space.n)
-        actions = draws.integers(n_actions, size=envs.num_envs)
-        masks = envs.action_masks()
-        for i in range(envs.num_envs // 2):
-            actions[i] = draws.choice(np.flatnonzero(masks[i]))
-        actions[draws.random(envs.num_envs) < draws.choice([0.0, 0.5, 0.95])] = 0
-        return actions
-    shape = envs.action_space.shape
+    actions = draws.integers(n_actions, size=envs.num_envs)
+    masks = envs.action_masks()
+    for i in range(envs.num_envs // 2):
+        actions[i] = draws.choice(np.flatnonzero(masks[i]))
+    actions[draws.random(envs.num_envs) < draws.choice([0.0, 0.5, 0.95])] = 0
+    return actions
+
+
+def injection_of(shape: tuple[int, ...], draws: np.random.Generator) -> NDArray[np.float32]:
+    """Small, large and extreme requests, and none at all."""
     actions = draws.uniform(-1.0, 1.0, shape) * draws.choice([0.02, 0.2, 1.0], size=(shape[0], 1))
     corners = draws.random(shape[0]) < 0.2
     actions[corners] = draws.choice([-1.0, 0.0, 1.0], size=(int(corners.sum()), shape[1]))
@@ -152,7 +164,7 @@ def play(grid: str, kind: str, setting: dict[str, Any], steps: int, seed: int, b
     found, began = Found(), time.monotonic()
     draws = np.random.default_rng([seed, GRID_IDS.index(grid), KINDS.index(kind)])
     number = SETTINGS.index(setting)
-    keywords = setting | ({"dispatch": DISPATCH[number % 2]} if kind == "R" else {})
+    keywords = setting | ({} if kind == "T" else {"dispatch": DISPATCH[number % 2]})
     envs: Any = gymnasium.make_vec(task_id(grid, kind), num_envs=NUM_ENVS, num_threads=1, **keywords)
     try:
         _play(envs, setting, steps, draws, seed, found, bar)
@@ -197,7 +209,7 @@ def _play(
         bar(played)
 
 
-def _bring_back(envs: Any, actions: NDArray[Any], found: Found) -> None:
+def _bring_back(envs: Any, actions: Any, found: Found) -> None:
     """Save all environments, step, and bring them back twice: the first time, the same step must follow."""
     worlds = [envs.save(j) for j in range(envs.num_envs)]
     observations, rewards, terminated, truncated, _ = envs.step(actions)
