@@ -83,10 +83,10 @@ def _run(options: argparse.Namespace, output: Output) -> int:
 
 
 def _check_agents(task: Task, options: argparse.Namespace) -> None:
-    """Refuse agents that are not to be had, before the first of several has played."""
+    """Refuse agents that are not to be had, before a folder is made and the first of several has played."""
     from rl2grid.evaluation.agents import make_agent
 
-    for agent in options.against:
+    for agent in (options.agent, *options.against):
         make_agent(agent, task)
 
 
