@@ -1,10 +1,11 @@
 """A disk that is full at any write: one sentence, and afterwards everything goes on.
 
-``python benchmarks/full_disk.py [--number 200] [--seed 0] [--only SUBJECT ...]`` lets every subject (those of
+``python benchmarks/full_disk.py [--number 15] [--seed 0] [--only SUBJECT ...]`` lets every subject (those of
 ``kills.py``, and what writes pictures and pages) run once on a disk of memory with room enough. Then it runs on disks
 that are full after a number of bytes drawn from what it took. It must end with a sentence that says so, without a
 traceback and not by a signal. Then the disk gets room, and what is called again must leave what was left the first
-time. Writes ``benchmarks/results/full_disk.json``. Linux, in a name space of its own (``unshare``), without privileges.
+time. Writes ``benchmarks/results/full_disk.json``, where a subject stays as it was until it is
+played by another command. Linux, in a name space of its own (``unshare``), without privileges.
 """
 
 from __future__ import annotations
@@ -133,9 +134,9 @@ def _on_a_full_disk(subject: Subject, folder: Path) -> str:
 def main() -> int:
     """Fill all disks, write the result, and say whether anything failed."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--number", type=int, default=200, help="disks of all subjects together")
+    parser.add_argument("--number", type=int, default=15, help="disks of each subject")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", nargs="+", default=None, help="these subjects alone; nothing is written")
+    parser.add_argument("--only", nargs="+", default=None, choices=[one.name for one in ALL])
     options = parser.parse_args()
     if INSIDE not in os.environ:
         os.environ[INSIDE] = "1"
@@ -145,9 +146,9 @@ def main() -> int:
 
         def fill(subject: Subject) -> Found:
             draws = random.Random(hashlib.sha256(f"{options.seed} {subject.name}".encode()).digest())
-            return run_subject(subject, -(-options.number // len(subjects)), Path(scratch) / "disk", draws)
+            return run_subject(subject, options.number, Path(scratch) / "disk", draws)
 
-        return run_campaign(RESULTS if options.only is None else None, subjects, fill, ("disks",))
+        return run_campaign(RESULTS, subjects, fill, ("disks",))
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
 """Kills at random moments: what was killed is called again, and must end as if nothing had happened.
 
-``python benchmarks/kills.py [--kills 200] [--seed 0] [--only SUBJECT ...]`` lets every subject (trainings of all
+``python benchmarks/kills.py [--kills 22] [--seed 0] [--only SUBJECT ...]`` lets every subject (trainings of all
 algorithms, an evaluation, labels, a study, the making of months, a ranking, the first compilation) run once in peace.
 Then it runs again with the whole group of processes killed (SIGKILL) at a moment drawn from the time that it took (the
 shortest so far), is called again as a user would, killed again, and at last left in peace. What it leaves must equal
 what it left the first time. A call that ends by itself before its moment is not counted as a kill. Writes
-``benchmarks/results/kills.json``.
+``benchmarks/results/kills.json``, where a subject stays as it was until it is played by another command.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from rl2grid import __version__
 from rl2grid.algorithms.policy_agent import load_agent
 from rl2grid.records.evaluations import load_evaluation
 from rl2grid.records.files import write_json
@@ -43,6 +44,9 @@ TRAININGS = {
     "td3": ("bus14-R", "--num-envs", "8", "--learning-starts", "256", "--decisions", "1536"),
 }
 OFTEN = ("--checkpoint-seconds", "0.5", "--evaluate-every", "512", "--validation-months", "2", "--heuristic", "idle")
+LABELS = ("teach", "greedy", "bus14-T0", "--months", "4", "--heuristic", "idle", "--episode-length", "2016")
+IMITATION = ("bus14-T0", "--num-steps", "4000", "--decisions", "80000", "--validation-months", "2",
+             "--evaluate-every", "20000", "--checkpoint-seconds", "0.5", "--heuristic", "idle")  # fmt: skip
 STUDY = """name = "kills"
 split = "validation"
 seeds = [1, 2]
@@ -78,8 +82,6 @@ class Subject:
     """Its data folder is the folder itself."""
     cold: bool = False
     """It finds no compiled code."""
-    share: float = 1.0
-    """How often it is killed, relative to others."""
 
 
 @dataclass
@@ -104,6 +106,19 @@ def _training(algorithm: str) -> Subject:
         return ["train", "--resume", str(folder / "run")] if known else first(folder)
 
     return Subject(f"train {algorithm}", first, again, _trained)
+
+
+def _imitation(folder: Path) -> list[str]:
+    """Learns from labels that lie beside the folder, made the first time."""
+    labels = folder.with_name("labels")
+    if not labels.exists():
+        subprocess.run([*PROGRAM, *LABELS, "--output", str(labels)], check=True, capture_output=True)
+    return ["train", "imitation", *IMITATION, "--labels", str(labels), "--output", str(folder / "run")]
+
+
+def _imitation_again(folder: Path) -> list[str]:
+    known = (folder / "run" / "config.json").exists()
+    return ["train", "--resume", str(folder / "run")] if known else _imitation(folder)
 
 
 def _trained(folder: Path) -> Any:
@@ -182,12 +197,13 @@ def _compilation(folder: Path) -> list[str]:
 
 SUBJECTS = (
     *map(_training, TRAININGS),
+    Subject("train imitation", _imitation, _imitation_again, _trained),
     Subject("evaluate", _evaluation, _evaluation, _evaluated),
     Subject("teach", _teaching, _teaching, _labelled),
     Subject("study", _study, _study, _studied),
     Subject("make months", _generation, _generation, _made, own_data=True),
     Subject("rank", _ranking, _ranking, _ranked),
-    Subject("first compilation", _compilation, _compilation, _evaluated, own_data=True, cold=True, share=0.5),
+    Subject("first compilation", _compilation, _compilation, _evaluated, own_data=True, cold=True),
 )
 
 
@@ -272,48 +288,45 @@ def run_subject(subject: Subject, kills: int, folder: Path, draws: random.Random
 
 
 def run_campaign(
-    results: Path | None, subjects: Sequence[Subject], break_it: Callable[[Subject], Any], counts: Sequence[str]
+    results: Path, subjects: Sequence[Subject], break_it: Callable[[Subject], Any], counts: Sequence[str]
 ) -> int:
-    """Break all subjects that the results of the same command do not have yet; returns the exit status.
+    """Break all subjects whose results are not those of the same command; returns the exit status.
 
     Args:
-        results: written after every subject; None: nowhere.
+        results: written after every subject; those of other subjects stay in it.
         subjects: what is broken.
         break_it: does it; what it returns has ``failures`` and all of ``counts``.
         counts: what is added up over the subjects.
     """
     command = shlex.join(["python", f"benchmarks/{Path(sys.argv[0]).name}", *sys.argv[1:]])
-    stored = json.loads(results.read_text()) if results is not None and results.exists() else {}
-    cells: dict[str, Any] = stored["subjects"] if stored.get("command") == command else {}
+    cells: dict[str, Any] = json.loads(results.read_text())["subjects"] if results.exists() else {}
     for subject in subjects:
-        if subject.name not in cells:
-            cells[subject.name] = vars(break_it(subject))
+        if cells.get(subject.name, {}).get("command") != command:
+            cells[subject.name] = {"command": command, "version": __version__, **vars(break_it(subject))}
         print(f"{subject.name}: {cells[subject.name]}", flush=True)
-        if results is not None:
-            total = {name: sum(cell[name] for cell in cells.values()) for name in counts}
-            failures = sum(len(cell["failures"]) for cell in cells.values())
-            write_json(results, {"command": command, **total, "failures": failures, "subjects": cells}, indent=1)
-    return 1 if any(cell["failures"] for cell in cells.values()) else 0
+        total = {name: sum(cell[name] for cell in cells.values()) for name in counts}
+        failures = sum(len(cell["failures"]) for cell in cells.values())
+        write_json(results, {**total, "failures": failures, "subjects": cells}, indent=1)
+    return 1 if any(cells[subject.name]["failures"] for subject in subjects) else 0
 
 
 def main() -> int:
     """Kill all subjects, write the result, and say whether anything failed."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--kills", type=int, default=200, help="of all subjects together")
+    parser.add_argument("--kills", type=int, default=22, help="of each subject")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", nargs="+", default=None, help="these subjects alone; nothing is written")
+    parser.add_argument("--only", nargs="+", default=None, choices=[one.name for one in SUBJECTS])
     parser.add_argument("--folder", type=Path, default=None, help="work here, and keep what failed")
     options = parser.parse_args()
     subjects = [one for one in SUBJECTS if options.only is None or one.name in options.only]
-    unit = options.kills / sum(one.share for one in subjects)
     with tempfile.TemporaryDirectory() as scratch:
         root = (options.folder or Path(scratch)).resolve()
 
         def kill(subject: Subject) -> Found:
-            kills, folder = -int(-unit * subject.share // 1), root / subject.name.replace(" ", "-")
-            return run_subject(subject, kills, folder, random.Random(f"{options.seed} {subject.name}"))
+            folder = root / subject.name.replace(" ", "-")
+            return run_subject(subject, options.kills, folder, random.Random(f"{options.seed} {subject.name}"))
 
-        return run_campaign(RESULTS if options.only is None else None, subjects, kill, ("kills", "runs", "calls"))
+        return run_campaign(RESULTS, subjects, kill, ("kills", "runs", "calls"))
 
 
 if __name__ == "__main__":
