@@ -9,12 +9,13 @@ from typing import Any
 import pytest
 from sample_results import result
 
+from rl2grid.algorithms.pretrained import pretrained
 from rl2grid.cli.main import main
 from rl2grid.envs.tasks import Task
 from rl2grid.errors import UsageError
 from rl2grid.ledger import subjects
 from rl2grid.ledger.subjects import find_subject, play_test
-from rl2grid.records.ledger import read_ledger
+from rl2grid.records.ledger import agent_of, choice_hash, read_ledger
 from rl2grid.scenarios.splits import SPLIT_VERSION
 
 
@@ -26,7 +27,7 @@ def played(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     def evaluate(agent: str, task: Task, **options: Any):
         asked.append({"agent": agent, "task": task, **options})
         months = {"split": "test", "split_version": SPLIT_VERSION, "generator_version": "1"}
-        return result(agent, [[0.5], [1.0]], options["heuristic"], task=task.id, **months)
+        return result(getattr(agent, "name", agent), [[0.5], [1.0]], options["heuristic"], task=task.id, **months)
 
     monkeypatch.setattr(subjects, "evaluate", evaluate)
     return asked
@@ -45,6 +46,44 @@ def test_an_agent_without_training_is_named_with_its_task(played):
     assert played[1]["scenarios"] == played[0]["scenarios"][:3]
     with pytest.raises(UsageError, match="Task"):
         find_subject("random@bus15-T0")
+
+
+def test_a_policy_of_the_package_is_tested_as_its_card_says(played):
+    subject = find_subject("pretrained/bus14-T0-idle", months=2)
+    card = pretrained("pretrained/bus14-T0-idle")
+    assert subject.configuration["policy_hash"] == card.policy_hash
+    assert (subject.task.id, subject.heuristic) == ("rl2grid/bus14-T0-v0", "idle")
+    stored = play_test(subject)
+    assert (played[0]["agent"], played[0]["heuristic"]) == ("pretrained/bus14-T0-idle", "idle")
+    assert stored.label == "pretrained/bus14-T0-idle + idle"
+
+
+def test_the_best_of_several_actions_is_another_configuration_of_the_same_method(played):
+    subject = find_subject("pretrained/bus14-T0", months=2)
+    best = find_subject("pretrained/bus14-T0", months=2, top_k=3)
+    assert best.digest != subject.digest
+    assert best.method == subject.method
+    assert play_test(best).label == "pretrained/bus14-T0, best of 3"
+    assert played[0]["agent"].name == "pretrained-bus14-T0, best of 3"
+    with pytest.raises(UsageError, match="top_k compares the best actions of a trained policy"):
+        find_subject("greedy@bus14-T0", top_k=3)
+
+
+def test_what_a_training_learned_from_counts_by_content_and_seeds_are_one_choice():
+    begun = {"algorithm": "imitation", "decisions": 10, "path": "a", "policy_hash": "1"}
+    labels = {"teacher": "greedy", "rounds": 1, "labels": ["f00"], "grid_hash": "0"}
+    found = [
+        {
+            "algorithm": "ppo",
+            "hyperparameters": {"seed": i},
+            **subjects._learned_from({"labels": labels, "start": start}),
+        }
+        for i, start in enumerate([begun, begun | {"path": "b", "policy_hash": "2"}, begun | {"decisions": 20}])
+    ]
+    assert found[0]["labels"] == {"teacher": "greedy", "rounds": 1, "labels": ["f00"]}
+    assert agent_of(found[0]) == "ppo from imitation"
+    assert choice_hash(found[0]) == choice_hash(found[1]) != choice_hash(found[2])
+    assert choice_hash(found[0]) != choice_hash(found[0] | {"labels": {"labels": ["bad"]}})
 
 
 def test_a_configuration_is_tested_once_and_verified_as_often_as_asked(played, tmp_path: Path, capsys):

@@ -30,7 +30,8 @@ LEGEND = (
     "shares of months, with Wilson's intervals. Marks: a, entered after other configurations of the same agent and "
     "heuristic had had their test on these months (their number); b, another budget (decisions, validations, months of "
     "each) than most trained rows of the task with that heuristic; s, a run that had been evaluated on test months "
-    "before; t, trained under a heuristic with targets of an earlier version."
+    "before; t, trained under a heuristic with targets of an earlier version. Decisions of a training that began from "
+    "another's policy are its own; imitation's are those of its labels, each as often as it was learned from."
 )
 _HEADINGS = (
     "task",
@@ -205,7 +206,7 @@ def _place(result: HashedTest) -> tuple[Any, ...]:
 
 def _cells(row: LedgerRow, compared: Difference | str | None) -> list[str]:
     first, training = row.first, [result.training for result in row.results]
-    cells = [short_id(first.task), first.agent, first.heuristic or "none", _months(first)]
+    cells = [short_id(first.task), first.player, first.heuristic or "none", _months(first)]
     if first.training:
         steps = sum(run["grid_steps"] for run in training) / len(training) / 1e6
         minutes, validation = ([run[name] for run in training] for name in ("minutes", "validation_survival"))

@@ -22,7 +22,7 @@ from rl2grid.scenarios.splits import SPLITS
 if TYPE_CHECKING:
     from rl2grid.records.evaluations import Evaluation
 
-_SUBJECT = "a run folder, or an agent without training as greedy@bus14-T0 or random@bus14-T0:idle"
+_SUBJECT = "a run folder, pretrained/NAME, or an agent without training as greedy@bus14-T0 or random@bus14-T0:idle"
 DIFFERENT = 1
 """Exit status when an entry is not what its actions make."""
 
@@ -50,7 +50,7 @@ def _add_test(actions: Any) -> None:
     parser = actions.add_parser("test", help="play the test months once, and enter the result in a ledger")
     parser.add_argument("subjects", nargs="*", metavar="subject", help=_SUBJECT)
     parser.add_argument("--ledger", type=Path, required=True, help="the file")
-    _add_months(parser)
+    _add_choices(parser)
     parser.set_defaults(run=_test)
 
 
@@ -58,12 +58,15 @@ def _add_verify(actions: Any) -> None:
     parser = actions.add_parser("verify", help="play the actions of entries, or tests of a ledger, again and compare")
     parser.add_argument("files", nargs="*", metavar="file", help=f"entries; with --ledger: each {_SUBJECT}")
     parser.add_argument("--ledger", type=Path, default=None, help="compare with the test results of this file")
-    _add_months(parser)
+    _add_choices(parser)
     parser.set_defaults(run=_verify)
 
 
-def _add_months(parser: argparse.ArgumentParser) -> None:
+def _add_choices(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--months", type=int, default=None, help="the first of the test months; by default all")
+    parser.add_argument(
+        "--top-k", type=int, default=None, metavar="K", help="of policies: the what-if chooses of their K best actions"
+    )
 
 
 def _add_table(actions: Any) -> None:
@@ -102,7 +105,7 @@ def _entry(options: argparse.Namespace, output: Output) -> int:
 def _test(options: argparse.Namespace, output: Output) -> int:
     from rl2grid.ledger.subjects import count_look, find_subject, play_test
 
-    for subject in [find_subject(text, options.months) for text in options.subjects]:
+    for subject in [find_subject(text, options.months, options.top_k) for text in options.subjects]:
         results = read_ledger(options.ledger)
         if subject.digest in results:
             output.remark(f"{subject.agent} on {subject.task.id} has had its test: see {options.ledger.name}.")
@@ -115,17 +118,17 @@ def _test(options: argparse.Namespace, output: Output) -> int:
 
 def _verify(options: argparse.Namespace, output: Output) -> int:
     if options.ledger is not None:
-        return _verify_tests(options.ledger, options.files, options.months, output)
+        return _verify_tests(options, output)
     return _verify_entries([Path(file) for file in _some(options.files)], output)
 
 
-def _verify_tests(ledger: Path, texts: Sequence[str], months: int | None, output: Output) -> int:
+def _verify_tests(options: argparse.Namespace, output: Output) -> int:
     from rl2grid.ledger.subjects import find_subject
     from rl2grid.ledger.verification import verify_test
 
     found: dict[str, str | None] = {}
-    for subject in [find_subject(text, months) for text in texts]:
-        stored = read_ledger(ledger).get(subject.digest)
+    for subject in [find_subject(text, options.months, options.top_k) for text in options.files]:
+        stored = read_ledger(options.ledger).get(subject.digest)
         if stored is None:
             raise UsageError(f"The ledger has no test of {str(subject.agent)!r} on {subject.task.id} to compare with.")
         difference = verify_test(stored, subject)

@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from rl2grid.algorithms.pretrained import is_pretrained, pretrained
 from rl2grid.envs.tasks import Task, find_task, short_id
 from rl2grid.errors import UsageError
+from rl2grid.evaluation.agents import make_agent
 from rl2grid.evaluation.protocol import AS_TRAINED, evaluate, first_months
 from rl2grid.records.collection import was_evaluated
 from rl2grid.records.evaluations import Evaluation, identity_hash
-from rl2grid.records.ledger import HashedTest, choice_hash, hashed_test
+from rl2grid.records.ledger import STARTED_FROM, HashedTest, agent_of, choice_hash, hashed_test
 from rl2grid.records.looks import LOOKS, earlier_choices, looks
 from rl2grid.records.metrics import read_validations, trained_seconds
 from rl2grid.records.trainings import read_training_run
 from rl2grid.scenarios.library import split_version
 from rl2grid.scenarios.splits import TEST
+
+_PLACES = ("labels", "start_from")
+"""Hyperparameters that are paths: what lies there is what counts."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +37,8 @@ class Subject:
     """How it came to be: command, decisions, minutes; empty without training."""
     last: Path | None = None
     """The checkpoint of the last policy; None where that is the best one, or nothing was trained."""
+    top_k: int | None = None
+    """Of how many of the policy's best actions the what-if chooses; None: it plays its best."""
 
     @property
     def digest(self) -> str:
@@ -46,29 +53,39 @@ class Subject:
     @property
     def method(self) -> tuple[Any, ...]:
         """What other configurations of it have in common, see :func:`rl2grid.records.looks.earlier_choices`."""
-        name = self.configuration.get("algorithm") or self.configuration["agent"]
-        return self.task.id, name, self.heuristic, self.configuration["test"]["split_version"]
+        return self.task.id, agent_of(self.configuration), self.heuristic, self.configuration["test"]["split_version"]
 
     def __str__(self) -> str:
         """What messages call it."""
-        return f"{self.agent} on {short_id(self.task.id)}, heuristic {self.heuristic}"
+        best = "" if self.top_k is None else f", best of {self.top_k}"
+        return f"{self.agent}{best} on {short_id(self.task.id)}, heuristic {self.heuristic}"
 
 
-def find_subject(text: str, months: int | None = None) -> Subject:
-    """What the command line names: a run folder, or an agent as ``greedy@bus14-T0`` or ``random@bus14-T0:idle``.
+def find_subject(text: str, months: int | None = None, top_k: int | None = None) -> Subject:
+    """What the command line names.
 
     Args:
-        text: the name.
+        text: a run folder, a policy of the package as ``pretrained/bus14-T0``, or an agent as ``greedy@bus14-T0`` or
+            ``random@bus14-T0:idle``.
         months: how many of the test months it plays, the first of the list; None: all.
+        top_k: of how many of a policy's best actions the what-if chooses; None: it plays its best.
 
     Raises:
-        UsageError: a run that is not finished or was never validated, or no such agent, task or run.
+        UsageError: a run that is not finished or was never validated, no such agent, task or run, or ``top_k`` for what
+            is no policy.
     """
     if "@" in text:
         agent, _, rest = text.partition("@")
         task, _, heuristic = rest.partition(":")
-        return _untrained(agent, find_task(task), heuristic or None, months)
-    return _trained(Path(text), months)
+        subject = _untrained(agent, find_task(task), heuristic or None, months)
+    elif is_pretrained(text):
+        subject = _of_the_package(text, months)
+    else:
+        subject = _trained(Path(text), months)
+    if top_k is None:
+        return subject
+    make_agent(subject.agent, subject.task, top_k=top_k)  # refuses agents that have no best actions
+    return replace(subject, configuration={**subject.configuration, "top_k": top_k}, top_k=top_k)
 
 
 def count_look(subject: Subject, results: Mapping[str, HashedTest]) -> str:
@@ -108,7 +125,7 @@ def play_test(subject: Subject, progress: bool = True) -> HashedTest:
 
 def _play(subject: Subject, agent: str | Path, progress: bool) -> Evaluation:
     return evaluate(
-        agent,
+        agent if subject.top_k is None else make_agent(agent, subject.task, top_k=subject.top_k),
         subject.task,
         split=TEST,
         scenarios=first_months(subject.task, TEST, subject.configuration["test"]["months"]),
@@ -128,9 +145,32 @@ def _frozen(keywords: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in keywords.items() if name != "episode_length" or value is not None}
 
 
+def _learned_from(identity: Mapping[str, Any]) -> dict[str, Any]:
+    """By content: which labels a training learned from, and which policy it began with; empty where there are none."""
+    found: dict[str, Any] = {}
+    if "labels" in identity:
+        found["labels"] = {name: identity["labels"][name] for name in ("teacher", "rounds", "labels")}
+    if "start" in identity:
+        found[STARTED_FROM] = {name: identity["start"][name] for name in ("algorithm", "decisions", "policy_hash")}
+    return found
+
+
 def _untrained(agent: str, task: Task, heuristic: str | None, months: int | None) -> Subject:
     configuration = {"agent": agent, "task": task.id, "heuristic": heuristic, "test": _test_of(task, months)}
     return Subject(configuration, agent, task, heuristic, {})
+
+
+def _of_the_package(name: str, months: int | None) -> Subject:
+    card = pretrained(name)
+    task = find_task(card.task)
+    configuration = {
+        "agent": name,
+        "policy_hash": card.policy_hash,
+        "task": task.id,
+        "heuristic": card.heuristic,
+        "test": _test_of(task, months),
+    }
+    return Subject(configuration, name, task, card.heuristic, {})
 
 
 def _trained(folder: Path, months: int | None) -> Subject:
@@ -147,10 +187,13 @@ def _trained(folder: Path, months: int | None) -> Subject:
     configuration = {
         "algorithm": args.algorithm,
         "task": args.task.id,
-        "hyperparameters": identifying(args.hyperparameters),
+        "hyperparameters": {
+            name: value for name, value in identifying(args.hyperparameters).items() if name not in _PLACES
+        },
         "env_keywords": _frozen(args.env_keywords),
         "targets_version": identity.get("targets_version", 1),
         "test": _test_of(args.task, months),
+        **_learned_from(identity),
     }
     policy = load_agent(folder)
     reached = read_validations(folder)

@@ -29,6 +29,8 @@ _TEST = {
     "test": {"episodes": int},
     "months": dict,
 }
+STARTED_FROM = "started_from"
+"""In a configuration: algorithm, decisions and hash of the policy that a training began with."""
 _FIGURES = ("survival", "completed", "cost_lsi", "cost_tlo", "safe_lsi", "safe_tlo", "decisions")
 
 
@@ -72,13 +74,19 @@ class HashedTest:
 
     @property
     def agent(self) -> str:
-        """The algorithm, or the agent without training."""
-        return str(self.configuration.get("algorithm") or self.configuration["agent"])
+        """See :func:`agent_of`."""
+        return agent_of(self.configuration)
+
+    @property
+    def player(self) -> str:
+        """The agent, and of how many of its best actions the what-if chose."""
+        top_k = self.configuration.get("top_k")
+        return self.agent if top_k is None else f"{self.agent}, best of {top_k}"
 
     @property
     def label(self) -> str:
-        """Agent and heuristic."""
-        return f"{self.agent} + {self.heuristic}" if self.heuristic else self.agent
+        """Player and heuristic."""
+        return f"{self.player} + {self.heuristic}" if self.heuristic else self.player
 
     @property
     def choice(self) -> str:
@@ -86,10 +94,27 @@ class HashedTest:
         return choice_hash(self.configuration)
 
 
+def agent_of(configuration: Mapping[str, Any]) -> str:
+    """The agent without training, or the algorithm; of one that began with another's policy, both."""
+    began = configuration.get(STARTED_FROM)
+    name = str(configuration.get("algorithm") or configuration["agent"])
+    return name if began is None else f"{name} from {began['algorithm']}"
+
+
 def choice_hash(configuration: Mapping[str, Any]) -> str:
-    """Hash of what was chosen: a configuration without its seed, which repeats a training and chooses nothing."""
-    others = {key: value for key, value in configuration.get("hyperparameters", {}).items() if key != "seed"}
-    return identity_hash({**configuration, "hyperparameters": others})
+    """Hash of what was chosen: a configuration without its seed, which repeats a training and chooses nothing.
+
+    So does a policy that it began with, if that is of another seed of the same algorithm.
+    """
+    chosen = dict(configuration)
+    chosen["hyperparameters"] = _without(configuration.get("hyperparameters", {}), "seed")
+    if STARTED_FROM in configuration:
+        chosen[STARTED_FROM] = _without(configuration[STARTED_FROM], "policy_hash")
+    return identity_hash(chosen)
+
+
+def _without(values: Mapping[str, Any], name: str) -> dict[str, Any]:
+    return {key: value for key, value in values.items() if key != name}
 
 
 def hashed_test(
