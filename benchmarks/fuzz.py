@@ -4,14 +4,15 @@
 of action, a quarter with each heuristic, and writes ``benchmarks/results/fuzz.json``. Half of the environments play
 legal actions, the others whatever the space has; now and then an environment is saved, played on and brought back, and
 must play the same again. Whatever breaks a rule of :func:`broken_rules`, raises an exception or is another step after
-coming back counts as a failure. A cell that is in the results of the same command is not played again.
+coming back counts as a failure. Redispatching plays some of its steps with Grid2Op's own solver, which takes most of
+the time. A cell that is in the results with as many steps and the same seed is not played again.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
-import shlex
 import sys
 import time
 import traceback
@@ -26,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-import rl2grid  # noqa: F401 - registers the tasks
+import rl2grid
 from rl2grid.grids import GRID_IDS, load_grid
 from rl2grid.records.files import write_json
 
@@ -39,7 +40,9 @@ SETTINGS: tuple[dict[str, Any], ...] = (
     {"heuristic": "recovery", "split": "train", "constraint": "TLO", "gamma": 0.9},
     {"heuristic": "careful", "split": "train", "constraint": "LSI", "reward": "released"},
 )
-DISPATCH = ("exact", "grid2op")
+SOLVER_OF_GRID2OP: dict[str, Any] = {"heuristic": "idle", "split": "train", "dispatch": "grid2op"}
+SHARE_OF_SOLVER = 0.01
+"""Of the steps of a grid, played with :data:`SOLVER_OF_GRID2OP` behind the others."""
 EVERY = 50
 """Steps after which one environment is saved, and after which it is brought back."""
 TOLERANCE = 1e-9
@@ -87,6 +90,14 @@ def task_id(grid: str, kind: str) -> str:
     """The task of a kind with the most actions."""
     level = "" if kind == "R" else len(load_grid(grid).level_sizes) - 1
     return f"rl2grid/{grid}-{kind}{level}-v0"
+
+
+def settings_of(kind: str, steps: int) -> Iterator[tuple[str, dict[str, Any], int]]:
+    """Name, keywords and number of grid steps of the cells of a kind on one grid."""
+    for setting in SETTINGS:
+        yield setting["heuristic"] or "no heuristic", setting, -(-steps // len(SETTINGS))
+    if kind != "T":
+        yield "Grid2Op's solver", SOLVER_OF_GRID2OP, round(steps * SHARE_OF_SOLVER)
 
 
 def actions_of(envs: Any, draws: np.random.Generator) -> Any:
@@ -163,9 +174,7 @@ def play(grid: str, kind: str, setting: dict[str, Any], steps: int, seed: int, b
     """Play a cell."""
     found, began = Found(), time.monotonic()
     draws = np.random.default_rng([seed, GRID_IDS.index(grid), KINDS.index(kind)])
-    number = SETTINGS.index(setting)
-    keywords = setting | ({} if kind == "T" else {"dispatch": DISPATCH[number % 2]})
-    envs: Any = gymnasium.make_vec(task_id(grid, kind), num_envs=NUM_ENVS, num_threads=1, **keywords)
+    envs: Any = gymnasium.make_vec(task_id(grid, kind), num_envs=NUM_ENVS, num_threads=1, **setting)
     try:
         _play(envs, setting, steps, draws, seed, found, bar)
     except Exception as error:  # whatever is raised is what is looked for
@@ -234,27 +243,26 @@ def main() -> int:
     parser.add_argument("--kinds", nargs="+", default=list(KINDS), choices=KINDS)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
-    command = shlex.join(["python", "benchmarks/fuzz.py", *sys.argv[1:]])
-    result: dict[str, Any] = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
-    cells = result["cells"] if result.get("command") == command else {}
-    each = -(-options.steps // len(SETTINGS))
+    cells: dict[str, Any] = json.loads(RESULTS.read_text())["cells"] if RESULTS.exists() else {}
+    asked = [
+        (f"{grid} {kind} {name}", grid, kind, setting, steps)
+        for grid, kind in itertools.product(options.grids, options.kinds)
+        for name, setting, steps in settings_of(kind, options.steps)
+    ]
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, TimeRemainingColumn(elapsed_when_finished=True)) as progress:
-        total = each * len(SETTINGS) * len(options.kinds) * len(options.grids)
-        bar = progress.add_task("grid steps", total=total)
-        for grid in options.grids:
-            for kind in options.kinds:
-                for setting in SETTINGS:
-                    name = f"{grid} {kind} {setting['heuristic'] or 'no heuristic'}"
-                    progress.update(bar, description=name)
-                    if name in cells:
-                        progress.advance(bar, each)
-                        continue
-                    found = play(grid, kind, setting, each, options.seed, lambda n: progress.advance(bar, n))
-                    cells[name] = vars(found) | {"game_overs": dict(sorted(found.game_overs.items()))}
-                    write_json(RESULTS, {"command": command, **_total(cells), "cells": cells}, indent=1)
-                    for words in found.examples:
-                        progress.console.print(f"{name}: {words}", markup=False)
+        bar = progress.add_task("grid steps", total=sum(steps for *_, steps in asked))
+        for name, grid, kind, setting, steps in asked:
+            progress.update(bar, description=name)
+            as_asked = {"version": rl2grid.__version__, "seed": options.seed, "asked": steps}
+            if as_asked.items() <= cells.get(name, {}).items():
+                progress.advance(bar, steps)
+                continue
+            found = play(grid, kind, setting, steps, options.seed, lambda n: progress.advance(bar, n))
+            cells[name] = as_asked | vars(found) | {"game_overs": dict(sorted(found.game_overs.items()))}
+            write_json(RESULTS, {**_total(cells), "cells": cells}, indent=1)
+            for words in found.examples:
+                progress.console.print(f"{name}: {words}", markup=False)
     print(f"{_total(cells)}")
     return 1 if _total(cells)["failures"] else 0
 

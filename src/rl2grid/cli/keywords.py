@@ -17,7 +17,7 @@ NAMES: tuple[str, ...] = tuple(option.name for option in options_without(*GIVEN_
 
 
 AGENT_HELP = (
-    "do-nothing, random, recovery, greedy, greedy-n1, milp, dc-opf, planner, a run folder or checkpoint, "
+    "do-nothing, random, recovery, greedy, greedy-n1, milp, dc-opf, planner, foresight, a run folder or checkpoint, "
     "pretrained/NAME, or one of your own as package.module:Agent or ./agent.py"
 )
 """What is played; a test compares it with the agents that there are."""

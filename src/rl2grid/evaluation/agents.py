@@ -8,6 +8,7 @@ from pathlib import Path
 from rl2grid.agents.agent import Agent, SpecialisedAgent
 from rl2grid.agents.dc_opf import DcOpf
 from rl2grid.agents.do_nothing import DoNothing
+from rl2grid.agents.foresight import Foresight
 from rl2grid.agents.greedy import Greedy
 from rl2grid.agents.greedy_topology import GreedyN1
 from rl2grid.agents.milp import Milp
@@ -29,6 +30,7 @@ AGENTS: dict[str, Callable[[], Agent]] = {
     Milp.name: Milp,
     DcOpf.name: DcOpf,
     "planner": Planner,
+    Foresight.name: Foresight,
 }
 """Agents that need no training, by name."""
 

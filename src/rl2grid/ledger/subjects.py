@@ -117,14 +117,18 @@ def count_look(subject: Subject, results: Mapping[str, HashedTest]) -> str:
 
 
 def play_test(subject: Subject, progress: bool = True) -> HashedTest:
-    """Play the test months, with a bar or without; what the ledger keeps of it."""
+    """Play the test months, with a bar or without; what the ledger keeps of it.
+
+    Raises:
+        UsageError: the agent knew the future.
+    """
     best = _play(subject, subject.agent, progress)
     last = None if subject.last is None else _play(subject, subject.last, progress)
     return hashed_test(subject.configuration, subject.training, best, last)
 
 
 def _play(subject: Subject, agent: str | Path, progress: bool) -> Evaluation:
-    return evaluate(
+    result = evaluate(
         agent if subject.top_k is None else make_agent(agent, subject.task, top_k=subject.top_k),
         subject.task,
         split=TEST,
@@ -132,6 +136,9 @@ def _play(subject: Subject, agent: str | Path, progress: bool) -> Evaluation:
         heuristic=AS_TRAINED if subject.training else subject.heuristic,
         progress=progress,
     )
+    if result.foresight:
+        raise UsageError(f"{subject} stepped saved true worlds: who knows the future is not ranked, and has no test.")
+    return result
 
 
 def _test_of(task: Task, months: int | None) -> dict[str, Any]:

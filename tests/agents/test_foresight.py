@@ -1,0 +1,77 @@
+"""The agent that knows the future: it keeps what it foresees, outlives its guide, and is marked."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import pytest
+
+import rl2grid  # noqa: F401 - registers the tasks
+from rl2grid.agents.do_nothing import DoNothing
+from rl2grid.agents.foresight import Foresight
+from rl2grid.envs.tasks import find_task
+from rl2grid.errors import UsageError
+from rl2grid.evaluation.protocol import evaluate, first_months
+from rl2grid.ledger import subjects
+
+MONTH = "bundled/0000"
+
+
+def foresight(**options: Any) -> Foresight:
+    return Foresight(DoNothing(), **{"ahead": 24, "candidates": 6, "attempts": 60, **options})
+
+
+def survived(agent: Any) -> Any:
+    months = first_months(find_task("bus14-T0"), "validation", 1)
+    result = evaluate(agent, "bus14-T0", scenarios=months, episode_length=2016)
+    return result.episodes[0]
+
+
+def test_it_outlives_its_guide_and_is_marked():
+    guided, alone = survived(foresight()), survived(DoNothing())
+    assert guided.grid_steps > alone.grid_steps
+    assert guided.foresight > 0 == alone.foresight
+
+
+def test_what_it_plays_is_what_it_foresaw():
+    env: Any = gymnasium.make("rl2grid/bus14-T0-v0", split="bundled")
+    agent = foresight()
+    agent.bind(env)
+    observation, info = env.reset(seed=0, options={"scenario": MONTH})
+    agent.reset(0)
+    over = False
+    while not over and info["step"] < 150:
+        action = agent.act(observation, info)
+        foreseen = [decision.step for decision in agent._course][:1]
+        observation, _, terminated, truncated, info = env.step(action)
+        over = terminated or truncated
+        assert foreseen == ([] if over else [info["step"]])
+
+
+def test_it_forgets_the_future_of_an_action_that_was_not_played():
+    env: Any = gymnasium.make("rl2grid/bus14-T0-v0", split="bundled")
+    agent = foresight()
+    agent.bind(env)
+    observation, info = env.reset(seed=0, options={"scenario": MONTH})
+    agent.reset(0)
+    agent.act(observation, info)
+    agent.overruled(7)
+    observation, *_, info = env.step(7)
+    agent.act(observation, info)
+    assert agent._course[0].step == info["step"] + 1
+
+
+def test_tasks_with_injections_and_nonsense_are_refused():
+    with pytest.raises(UsageError, match="has injections: choose a topology task"):
+        foresight().bind(gymnasium.make("rl2grid/bus14-R-v0", split="bundled"))
+    with pytest.raises(UsageError, match="attempts=0 is not allowed"):
+        foresight(attempts=0)
+
+
+def test_who_knows_the_future_has_no_test(monkeypatch):
+    monkeypatch.setattr(subjects, "evaluate", lambda agent, task, **_: evaluate(
+        foresight(), task, split="bundled", scenarios=[MONTH], episode_length=100))  # fmt: skip
+    subject = subjects.find_subject("foresight@bus14-T0", months=1)
+    with pytest.raises(UsageError, match="who knows the future is not ranked"):
+        subjects.play_test(subject)
