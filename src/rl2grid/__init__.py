@@ -1,6 +1,6 @@
 """rl2grid: a benchmark for reinforcement learning in power-grid operation.
 
-Importing the package registers the tasks with Gymnasium::
+Importing the package registers the tasks with Gymnasium, whichever of the two is imported first::
 
     import gymnasium, rl2grid
     env = gymnasium.make("rl2grid/bus14-T0-v0", heuristic="idle")
@@ -16,20 +16,21 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rl2grid.envs.registration import register_all, register_from_environment, register_system
+from rl2grid.envs.on_import import register_from_environment, register_with_gymnasium
 
 if TYPE_CHECKING:
     from rl2grid.agents.agent import Agent
     from rl2grid.algorithms.policy_agent import PolicyAgent
     from rl2grid.envs.tasks import Task
+    from rl2grid.grids import System
     from rl2grid.records.evaluations import Evaluation
 
 __all__ = ["evaluate", "load", "register_system", "tasks", "teach", "train"]
 __version__ = "1.0.0rc1"
 
-register_all()
+register_with_gymnasium()
 
-# What the functions need is imported when they are called: environments do without PyTorch and the compiled engine.
+# What the functions need is imported when they are called: help does without NumPy, environments without PyTorch.
 
 
 def tasks(grid: str | None = None) -> dict[str, Task]:
@@ -51,6 +52,24 @@ def tasks(grid: str | None = None) -> dict[str, Task]:
     if not chosen:
         raise one_of("Grid", grid, tuple(dict.fromkeys(task.grid_id for task in every.values())))
     return chosen
+
+
+def register_system(system: System) -> None:
+    """Give a grid everything that the seven have: tasks, scenarios, rankings, evaluation, pages.
+
+    Its tasks are ``rl2grid/<id>-T<level>[-LSI|-TLO]-v0``, ``rl2grid/<id>-R-v0`` and
+    ``rl2grid/<id>-H<level>[-LSI|-TLO]-v0``. Workers of vectors and evaluations know it too. It takes the place of an
+    earlier system of the same grid, in environments that are made from then on.
+
+    Args:
+        system: The grid, with what it plays.
+
+    Raises:
+        UsageError: its id cannot be part of a task's, or is that of another grid; or there is nothing to play.
+    """
+    from rl2grid.envs import registration
+
+    registration.register_system(system)
 
 
 def train(

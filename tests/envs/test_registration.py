@@ -113,7 +113,7 @@ bus14 = find_system("bus14")
 rl2grid.register_system(System(replace(bus14.grid, id="yours"), bus14.network, bus14.scenarios))
 """
 SHOWN = """
-import sys, rl2grid
+import sys, rl2grid.envs.tasks
 print([each for each in rl2grid.envs.tasks.all_tasks() if "yours" in each], "numba" in sys.modules)
 """
 

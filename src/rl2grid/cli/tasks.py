@@ -7,9 +7,8 @@ from typing import Any
 
 from rl2grid.analysis.table import Cell, Column, ResultTable
 from rl2grid.cli.output import Output
-from rl2grid.envs.tasks import Task, all_tasks, tasks_of
-from rl2grid.grids import find_system
-from rl2grid.mdp.features import observation_size
+from rl2grid.cli.task_records import task_records
+from rl2grid.errors import one_of
 
 _COLUMNS = (
     Column("id", words=True),
@@ -26,43 +25,32 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace, output: Output) -> int:
-    chosen = tuple(all_tasks().values()) if options.grid is None else tasks_of(find_system(options.grid))
-    records = [_record(task) for task in chosen]
-    rows = tuple(
-        tuple(Cell(text) for text in _cells(task, record)) for task, record in zip(chosen, records, strict=True)
-    )
-    output.table(ResultTable("tasks", "", _COLUMNS, rows), records, title=f"{len(chosen)} tasks")
+    records = _chosen(options.grid)
+    rows = tuple(tuple(Cell(text) for text in _cells(record)) for record in records)
+    output.table(ResultTable("tasks", "", _COLUMNS, rows), records, title=f"{len(records)} tasks")
     return 0
 
 
-def _record(task: Task) -> dict[str, Any]:
-    grid = task.grid
-    return {
-        "id": task.id,
-        "grid": grid.id,
-        "kind": task.kind,
-        "level": task.level if task.changes_topology else None,
-        "substations": grid.n_sub,
-        "lines": grid.n_line,
-        "generators": grid.n_gen,
-        "loads": grid.n_load,
-        "storages": grid.n_storage,
-        "observation": observation_size(grid, task.kind),
-        "actions": task.n_actions,
-        "topology_actions": task.n_topology_actions,
-        "continuous_actions": task.n_injections,
-        "opponent": None if grid.opponent.kind == "none" else grid.opponent.kind,
-        "constraint": task.constraint,
-    }
+def _chosen(grid: str | None) -> list[dict[str, Any]]:
+    records = task_records()
+    grids = tuple(dict.fromkeys(record["grid"] for record in records))
+    if grid is not None and grid not in grids:
+        raise one_of("Grid", grid, grids)
+    return [record for record in records if grid in (None, record["grid"])]
 
 
-def _cells(task: Task, record: dict[str, Any]) -> tuple[str, ...]:
+def _cells(record: dict[str, Any]) -> tuple[str, ...]:
     sizes = ("substations", "lines", "generators", "loads", "storages", "observation")
     opponent = record["opponent"]
     return (
-        task.id,
+        record["id"],
         *(str(record[name]) for name in sizes),
-        task.actions_in_words,
+        _actions(record),
         "maintenance" if opponent is None else f"maintenance, {opponent.replace('_', '-')} opponent",
-        task.constraint or "",
+        record["constraint"] or "",
     )
+
+
+def _actions(record: dict[str, Any]) -> str:
+    kinds = ((record["topology_actions"], "discrete"), (record["continuous_actions"], "continuous"))
+    return " and ".join(f"{number:,} {kind}" for number, kind in kinds if number)

@@ -2,14 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
-import os
-import sys
-from pathlib import Path
-
-import gymnasium
-
 from rl2grid.benchmark import BENCHMARK
 from rl2grid.envs.tasks import tasks_of
 from rl2grid.errors import UsageError
@@ -17,9 +9,8 @@ from rl2grid.grids import System, find_system, system_ids
 from rl2grid.grids.systems import add_system, remove_system
 from rl2grid.scenarios.splits import BUNDLED
 
-VARIABLE = "RL2GRID_SYSTEMS"
-"""Environment variable that names what registers a user's systems when ``rl2grid`` is imported: modules or Python
-files, separated as in ``PATH``. Commands and the processes that they start know the systems by it."""
+# Gymnasium is imported where it is needed: at the end of its import this module is (:mod:`rl2grid.envs.on_import`),
+# which may not be in the midst of its own then.
 
 
 def register_system(system: System) -> None:
@@ -36,31 +27,14 @@ def register_system(system: System) -> None:
         raise UsageError(f"Grid {system.id!r} is one of the benchmark: give yours an id of its own.")
     if not system.scenarios.listed(system.grid, BUNDLED):
         raise UsageError(f"System {system.id} has no time series: give it scenarios.")
-    _register(system)
+    add_system(system)
+    _register_tasks(system)
 
 
 def register_all() -> None:
-    """Register the seven systems of the benchmark; ids that are registered already stay as they are."""
+    """Have Gymnasium know the tasks of the benchmark; ids that are registered already stay as they are."""
     for system in BENCHMARK:
-        _register(system)
-
-
-def register_from_environment() -> None:
-    """Import what :data:`VARIABLE` names.
-
-    Raises:
-        UsageError: there is no such module or file.
-    """
-    for name in filter(None, os.environ.get(VARIABLE, "").split(os.pathsep)):
-        if name.endswith(".py"):
-            _run_file(Path(name))
-            continue
-        try:
-            importlib.import_module(name)
-        except ModuleNotFoundError as error:
-            raise UsageError(
-                f"{VARIABLE} names {name!r}, which cannot be imported ({error}): give modules or Python files."
-            ) from error
+        _register_tasks(system)
 
 
 def unregister_system(grid_id: str) -> None:
@@ -69,6 +43,8 @@ def unregister_system(grid_id: str) -> None:
     Raises:
         UsageError: none of that name is registered.
     """
+    import gymnasium
+
     for task in tasks_of(find_system(grid_id)):
         gymnasium.registry.pop(task.id, None)
     remove_system(grid_id)
@@ -79,9 +55,10 @@ def own_systems() -> tuple[System, ...]:
     return tuple(system for system in map(find_system, system_ids()) if system not in BENCHMARK)
 
 
-def _register(system: System) -> None:
-    add_system(system)
-    for task in tasks_of(find_system(system.id)):
+def _register_tasks(system: System) -> None:
+    import gymnasium
+
+    for task in tasks_of(system):
         if task.id in gymnasium.registry:
             continue
         gymnasium.register(
@@ -90,15 +67,3 @@ def _register(system: System) -> None:
             vector_entry_point="rl2grid.envs.vector:PowerGridVectorEnv",
             kwargs={"task": task.id},
         )
-
-
-def _run_file(file: Path) -> None:
-    name = f"rl2grid_systems_{file.stem}"
-    if name in sys.modules:
-        return
-    spec = importlib.util.spec_from_file_location(name, file)
-    if not file.is_file() or spec is None or spec.loader is None:
-        raise UsageError(f"{VARIABLE} names {file}, and there is no such file: give modules or Python files.")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    spec.loader.exec_module(module)

@@ -1,12 +1,13 @@
 """Systems: a grid with everything that it is played with, as one value, and the registry of those that exist.
 
 Grids, networks, rankings, scenarios and tasks are looked up by the id of a grid, and all of it here. The seven of the
-benchmark (:mod:`rl2grid.benchmark`) are registered when ``rl2grid`` is imported, in the way in which a user's own are
+benchmark (:mod:`rl2grid.benchmark`) are registered when one is first looked up, in the way in which a user's own are
 (:func:`rl2grid.register_system`).
 """
 
 from __future__ import annotations
 
+import importlib
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -176,11 +177,19 @@ class System:
 
 
 _SYSTEMS: dict[str, System] = {}
+_BENCHMARK = "rl2grid.benchmark"
+"""The module that registers the seven; it knows of layers above this one, which therefore has its name alone."""
+
+
+def _systems() -> dict[str, System]:
+    """All registered systems by the id of their grid; the seven of the benchmark are the first."""
+    importlib.import_module(_BENCHMARK)
+    return _SYSTEMS
 
 
 def system_ids() -> tuple[str, ...]:
     """Ids of all registered systems: the seven of the benchmark, then a user's own as they were registered."""
-    return tuple(_SYSTEMS)
+    return tuple(_systems())
 
 
 def find_system(grid_id: str) -> System:
@@ -189,9 +198,10 @@ def find_system(grid_id: str) -> System:
     Raises:
         UsageError: none of that name is registered.
     """
-    if grid_id not in _SYSTEMS:
+    systems = _systems()
+    if grid_id not in systems:
         raise one_of("Grid", grid_id, system_ids())
-    return _SYSTEMS[grid_id]
+    return systems[grid_id]
 
 
 def load_grid(grid_id: str) -> Grid:
@@ -213,9 +223,10 @@ def add_system(system: System) -> None:
     """
     if _ID.fullmatch(system.id) is None:
         raise UsageError(f"Grid {system.id!r} cannot name tasks: use letters, digits, '_', '-' and '.' only.")
-    if system.id in _SYSTEMS and _SYSTEMS[system.id].hash != system.hash:
+    systems = _systems()
+    if system.id in systems and systems[system.id].hash != system.hash:
         raise UsageError(f"Another grid is registered as {system.id!r}: give this one an id of its own.")
-    _SYSTEMS[system.id] = system
+    systems[system.id] = system
 
 
 def remove_system(grid_id: str) -> None:
