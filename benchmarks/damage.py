@@ -35,7 +35,7 @@ import numba
 import numpy as np
 
 from rl2grid.algorithms.policy_agent import load_agent
-from rl2grid.compiled_files import verify_files_of
+from rl2grid.compiled_files import keep_code_of
 from rl2grid.engines import ENGINES  # noqa: F401 - loads the native engine before anything is measured
 from rl2grid.envs.tasks import find_task
 from rl2grid.errors import UsageError
@@ -201,13 +201,9 @@ def _triple(x: int) -> int:
 
 def _call(folder: Path, function: Callable[[int], int]) -> int:
     """Call a function as a process does that finds its machine code in the folder, or compiles it."""
-    before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(folder)
-    try:
-        compiled = numba.njit(cache=True)(function)
-        verify_files_of(compiled)
-        return int(compiled(4))
-    finally:
-        numba.config.CACHE_DIR = before
+    compiled = numba.njit(function)
+    keep_code_of(compiled, folder)
+    return int(compiled(4))
 
 
 def _in_data(folder: Path, do: Callable[[], Any]) -> Any:

@@ -1,6 +1,7 @@
 """Tests of :mod:`rl2grid.compile`."""
 
 import ast
+import functools
 from pathlib import Path
 
 import numba
@@ -9,7 +10,7 @@ import pytest
 
 from rl2grid import compile as compile_module
 from rl2grid.arrays import I64
-from rl2grid.compile import INTERPRETED_LAYERS, jit
+from rl2grid.compile import INTERPRETED_LAYERS, INTERPRETED_MODULES, jit
 
 PACKAGE = Path(compile_module.__file__).parent
 
@@ -31,15 +32,71 @@ def test_literals_of_callers_compile_a_function_once() -> None:
     assert types == {(numba.int64, numba.boolean)}
 
 
+def _compiles(source: Path) -> bool:
+    """Whether a module has compiled functions: what it would need for them is imported."""
+    nodes = list(ast.walk(ast.parse(source.read_text(encoding="utf-8"))))
+    whole = {name.name for node in nodes if isinstance(node, ast.Import) for name in node.names}
+    parts = {(node.module, name.name) for node in nodes if isinstance(node, ast.ImportFrom) for name in node.names}
+    ours = {("rl2grid.compile", name) for name in ("jit", "borrowing_jit", "owning_jit")}
+    return bool(parts & ours) or "numba" in {
+        name.partition(".")[0] for name in whole | {str(each) for each, _ in parts}
+    }
+
+
 @pytest.mark.parametrize("layer", INTERPRETED_LAYERS)
 def test_layers_left_out_of_the_cache_key_compile_nothing(layer: str) -> None:
     sources = sorted((PACKAGE / layer).rglob("*.py"))
     assert sources
-    for source in sources:
-        for node in ast.walk(ast.parse(source.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.ImportFrom) and node.module == "rl2grid.compile":
-                assert "jit" not in {name.name for name in node.names}, source
-            if isinstance(node, ast.Import):
-                assert "numba" not in {name.name.split(".")[0] for name in node.names}, source
-            if isinstance(node, ast.ImportFrom) and node.module:
-                assert node.module.split(".")[0] != "numba", source
+    assert not [source for source in sources if _compiles(source)]
+
+
+def _is_compiled(node: ast.AST) -> bool:
+    return isinstance(node, ast.FunctionDef) and any("jit" in ast.unparse(each) for each in node.decorator_list)
+
+
+@functools.cache
+def _names_in_compiled_functions() -> dict[Path, tuple[dict[str, tuple[str, str]], set[str]]]:
+    """By source: what each imported name may be, a module or something in one, and the names in compiled functions."""
+    found = {}
+    for source in PACKAGE.rglob("*.py"):
+        nodes = list(ast.walk(ast.parse(source.read_text(encoding="utf-8"))))
+        imports = [node for node in nodes if isinstance(node, ast.ImportFrom) and node.module]
+        imported = {
+            name.asname or name.name: (str(node.module), f"{node.module}.{name.name}")
+            for node in imports
+            for name in node.names
+        }
+        compiled = [inner for node in nodes if _is_compiled(node) for inner in ast.walk(node)]
+        found[source] = imported, {node.id for node in compiled if isinstance(node, ast.Name)}
+    return found
+
+
+@pytest.mark.parametrize("module", INTERPRETED_MODULES)
+def test_modules_left_out_of_the_cache_key_are_not_used_by_compiled_functions(module: str) -> None:
+    assert (PACKAGE / module).is_file()
+    dotted = ".".join(["rl2grid", *Path(module).with_suffix("").parts]).removesuffix(".__init__")
+    for source, (imported, used) in _names_in_compiled_functions().items():
+        assert not used or source != PACKAGE / module
+        known = {name for name, origins in imported.items() if dotted in origins}
+        assert not known & used, source
+
+
+def _key(package: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    monkeypatch.setattr(compile_module, "__file__", str(package / "compile.py"))
+    return str(compile_module.cache_directory.__wrapped__().name)
+
+
+def test_the_cache_key_is_of_what_compiled_functions_use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    uncounted = [*INTERPRETED_MODULES, *(f"{layer}/module.py" for layer in INTERPRETED_LAYERS)]
+    counted = ["compile.py", "compiled_files.py", "handles.py", "memory.py", "engines/native/advance.py"]
+    for name in (*counted, *uncounted):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    keys = [_key(tmp_path, monkeypatch)]
+    for name in uncounted:
+        (tmp_path / name).write_text("edited")
+    assert _key(tmp_path, monkeypatch) == keys[0]
+    for name in counted:
+        (tmp_path / name).write_text("edited")
+        keys.append(_key(tmp_path, monkeypatch))
+    assert len(set(keys)) == 1 + len(counted)

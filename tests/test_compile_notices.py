@@ -75,8 +75,27 @@ def test_a_long_compilation_says_how_far_it_is(monkeypatch: pytest.MonkeyPatch):
     notices.finish()
     notices.finish()
     assert said == [
-        "compiling the engine for this machine, once per installation; this may take a minute or two.",
+        "compiling the engine for this machine, once per installation; this may take a minute or two, on a busy "
+        "machine several.",
         "still compiling the engine: 2 functions in 12 s so far.",
         "still compiling the engine: 4 functions in 24 s so far.",
         "compiled 4 functions in 24.0 s.",
+    ]
+
+
+def test_who_waits_for_another_process_says_so(monkeypatch: pytest.MonkeyPatch):
+    said: list[str] = []
+    clock = iter(range(0, 1000, 6))
+    monkeypatch.setattr(compile_notices, "say", said.append)
+    monkeypatch.setattr(compile_notices.time, "monotonic", lambda: next(clock))
+    notices = compile_notices.Notices()
+    notices.wait("mine")
+    for _ in range(3):
+        notices.wait("rl2grid.engines.native.advance")
+    notices.finish()
+    assert said == [
+        "another process compiles the engine for this machine, which may take a minute or two, on a busy machine "
+        "several; this one waits.",
+        "still compiling the engine in another process: 12 s so far.",
+        "another process has compiled it in 18.0 s.",
     ]

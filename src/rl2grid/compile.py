@@ -2,7 +2,7 @@
 
 Numba's on-disk cache notices an edit of the file that defines a function, but not of the functions
 that it calls. The cache directory is therefore keyed by a hash of the sources and by Numba's version:
-an edit begins a fresh cache, and nothing stale is ever run. Layers without compiled functions do not count.
+an edit begins a fresh cache, and nothing stale is ever run. What compiled functions do not use does not count.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import platformdirs
 from numba.core.types.misc import unliteral
 
 from rl2grid import compile_notices
-from rl2grid.compiled_files import verify_files_of
+from rl2grid.compiled_files import keep_code_of
 
 compile_notices.install()
 
@@ -33,6 +33,13 @@ INTERPRETED_LAYERS = (
 )  # fmt: skip
 """Subpackages without compiled functions: an edit of them leaves the compiled ones what they are."""
 
+INTERPRETED_MODULES = (
+    "__init__.py", "__main__.py", "benchmark.py", "compile_locks.py", "compile_notices.py",
+    "errors.py", "processes.py",
+)  # fmt: skip
+"""Modules beside compiled functions nothing of which they use: what takes part in an import, says something, or starts
+processes."""
+
 
 @functools.cache
 def cache_directory() -> Path:
@@ -41,7 +48,7 @@ def cache_directory() -> Path:
     digest = hashlib.sha256(numba.__version__.encode())
     for path in sorted(package.rglob("*.py")):
         name = path.relative_to(package)
-        if name.parts[0] in INTERPRETED_LAYERS:
+        if name.parts[0] in INTERPRETED_LAYERS or name.as_posix() in INTERPRETED_MODULES:
             continue
         digest.update(name.as_posix().encode())
         digest.update(path.read_bytes())
@@ -54,13 +61,8 @@ def jit(function: Function) -> Function:
     Division by zero follows NumPy, and floating point stays strict: results do not depend on how
     a loop is vectorised.
     """
-    previous = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = str(cache_directory())
-    try:
-        compiled: Function = numba.njit(cache=True, error_model="numpy", nogil=True)(function)
-    finally:
-        numba.config.CACHE_DIR = previous
-    verify_files_of(compiled)
+    compiled: Function = numba.njit(error_model="numpy", nogil=True)(function)
+    keep_code_of(compiled, cache_directory())
     _take_literals_as_numbers(compiled)
     return compiled
 
