@@ -11,7 +11,7 @@ from numba.core.errors import TypingError
 from numpy.typing import NDArray
 
 from rl2grid.arrays import F32, F64, I32, Flags
-from rl2grid.handles import Handle, opener
+from rl2grid.handles import AsOpened, Handle, opener
 from rl2grid.structures import allocate, blank_row, constant, copy_row, episode, row, scratch, workspace
 
 DTYPES = (
@@ -275,3 +275,31 @@ def test_a_row_is_blanked_as_declared():
     for name in Rows._fields:
         np.testing.assert_array_equal(getattr(mine, name), getattr(expected, name), err_msg=name)
         np.testing.assert_array_equal(getattr(theirs, name), getattr(expected, name), err_msg=name)
+
+
+@pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled")
+def test_python_and_compiled_callers_share_the_machine_code():
+    class Pair(NamedTuple):
+        flat: Annotated[F64, constant("a")]
+        table: Annotated[I32, constant("b c")]
+
+    @numba.njit
+    def total(pair, k):
+        return pair.flat[k] + pair.table[k, 0]
+
+    open_pair = opener(Pair)
+
+    @numba.njit
+    def twice(address, k):
+        return 2 * total(open_pair(address), k)
+
+    pair = allocate(Pair, SIZES)
+    pair.flat[:], pair.table[:] = 0.5, 3
+    opened = AsOpened()
+    assert twice(Handle(pair).address, 1) == 7.0
+    assert total(opened(pair), 1) == 3.5
+    assert len(total.signatures) == 1
+    other = allocate(Pair, SIZES)
+    other.flat[:], other.table[:] = 1.5, 4
+    assert [total(opened(each), 2) for each in (pair, other, pair)] == [3.5, 5.5, 3.5]
+    assert len(total.signatures) == 1

@@ -7,26 +7,33 @@ address of the table into a value whose attributes are the arrays, so that funct
 (``state.rho[i, line]``) compile for it unchanged. A field may be a structure itself
 (``environments.state.rho[i, line]``): all that an engine works with is then one number, passed on for nothing.
 
+A function that takes an opened structure can be called from Python too, with what :class:`AsOpened` makes of one:
+handed a NamedTuple, it and all that it calls would be compiled a second time.
+
 The handle must be kept for as long as its address is used, and the arrays must not be replaced.
 """
 
 from __future__ import annotations
 
 import copy
+import functools
 import hashlib
 from collections.abc import Callable
-from typing import Any, Generic
+from typing import Any, Generic, cast
 
+import numba
 import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.core.datamodel import models
 from numba.core.extending import (
+    NativeValue,
     intrinsic,
     lower_builtin,
     lower_getattr_generic,
     register_model,
     type_callable,
+    unbox,
 )
 from numba.core.imputils import impl_ret_borrowed
 from numba.core.typing.templates import AttributeTemplate, infer_getattr
@@ -59,6 +66,11 @@ class Handle(Generic[Structure]):
         self._table = np.array(words, np.int64)
         self.address: int = self._table.ctypes.data
 
+    @property
+    def _numba_type_(self) -> HandleType:
+        """What a compiled function takes it for that is called with it."""
+        return _opened_type(type(self.structure))
+
     def point_at(self, name: str, part: Handle[Any]) -> None:
         """Let compiled code see another structure of the same kind as ``name``; the caller keeps it."""
         self._table[self._first_part + list(self._parts).index(name)] = part.address
@@ -90,6 +102,37 @@ class HandleType(types.Type):  # type: ignore[misc]
         # The name goes into the symbol of every function that takes the handle: it had better be short.
         digest = hashlib.sha256(repr((self.attributes, declaration.fields)).encode()).hexdigest()[:16]
         super().__init__(name=f"{kind.__name__}.{digest}")
+
+
+@functools.cache
+def _opened_type(kind: type[tuple[Any, ...]]) -> HandleType:
+    return HandleType(kind)
+
+
+@unbox(HandleType)  # type: ignore[untyped-decorator]
+def _unbox_handle(handle: HandleType, value: Any, context: Any) -> Any:
+    address = context.pyapi.object_getattr_string(value, "address")
+    number = context.pyapi.long_as_longlong(address)
+    context.pyapi.decref(address)
+    return NativeValue(number)
+
+
+class AsOpened(Generic[Structure]):
+    """Hands structures from Python to compiled functions as these hand them to one another.
+
+    It remembers the handle of the last structure. Where Numba is told not to compile, structures stay what they are.
+    """
+
+    def __init__(self) -> None:
+        self._handle: Handle[Structure] | None = None
+
+    def __call__(self, structure: Structure) -> Structure:
+        """The structure, for a compiled function."""
+        if numba.config.DISABLE_JIT:
+            return structure
+        if self._handle is None or self._handle.structure is not structure:
+            self._handle = Handle(structure)
+        return cast(Structure, self._handle)
 
 
 @register_model(HandleType)
@@ -133,7 +176,7 @@ def _read_attribute(context: Any, builder: Any, handle: HandleType, address: Any
 
 def opener(kind: type[Structure]) -> Callable[[int], Structure]:
     """A function for compiled code that turns the address of a handle to a structure into the structure."""
-    handle = HandleType(kind)
+    handle = _opened_type(kind)
 
     @intrinsic  # type: ignore[untyped-decorator]
     def open_handle(typing_context: Any, address: Any) -> Any:

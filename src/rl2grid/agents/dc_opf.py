@@ -52,7 +52,7 @@ class DcOpf(DispatchAgent):
 
     def _choose(self) -> NDArray[np.float32]:
         state: GridState = self._env.state
-        safe = is_safe(state, 0)
+        safe = is_safe(self._opened(state), 0)
         if safe and not anything_dispatched(state):
             return self._nothing.copy()
         action = self._plan(state)

@@ -12,6 +12,7 @@ from rl2grid.agents.agent import Action, has_injections, injecting_action
 from rl2grid.arrays import F64
 from rl2grid.errors import UsageError
 from rl2grid.grids import STEPS_PER_HOUR, Grid
+from rl2grid.handles import AsOpened
 from rl2grid.mdp.actions import continuous_layout
 from rl2grid.mdp.state import GridState
 from rl2grid.powerflow.model import load_network
@@ -51,6 +52,7 @@ class DispatchAgent:
             raise UsageError(self.refusal)
         base: Any = env.unwrapped
         self._env, self._space = base, env.action_space
+        self._opened: AsOpened[GridState] = AsOpened()
         self._topology = 0
         self._grid: Grid = base.grid
         self._network = load_network(self._grid)

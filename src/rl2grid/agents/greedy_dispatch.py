@@ -74,7 +74,7 @@ class GreedyDispatch(DispatchAgent):
         state: GridState = self._env.state
         self._topology = topology
         self._remember([], np.zeros(0), "")
-        if not is_safe(state, 0):
+        if not is_safe(self._opened(state), 0):
             return self._relieve(state)
         return self._give_back(state) if anything_dispatched(state) else self._nothing.copy()
 

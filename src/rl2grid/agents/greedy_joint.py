@@ -12,7 +12,9 @@ from rl2grid.agents.dispatch import worst_loading
 from rl2grid.agents.greedy_dispatch import GreedyDispatch
 from rl2grid.agents.greedy_topology import GreedyTopology
 from rl2grid.errors import UsageError
+from rl2grid.handles import AsOpened
 from rl2grid.mdp.heuristics import SAFE_RHO, is_safe
+from rl2grid.mdp.state import GridState
 
 _NOTHING = 0
 
@@ -43,6 +45,7 @@ class GreedyJoint:
         if not isinstance(env.action_space, gymnasium.spaces.Dict):
             raise UsageError("A topology action and a dispatch are searched for on joint tasks (-H0-, ...) only.")
         self._env: Any = env.unwrapped
+        self._opened: AsOpened[GridState] = AsOpened()
         self._space = env.action_space
         self._topology.bind(env)
         self._dispatch.bind(env)
@@ -53,7 +56,7 @@ class GreedyJoint:
     def act(self, observation: Observation, info: Info) -> Action:
         """The topology action, and the injection that goes with it."""
         chosen = self._topology.choose()
-        self._alone = chosen != _NOTHING and not is_safe(self._env.state, 0) and self._is_enough(chosen)
+        self._alone = chosen != _NOTHING and not self._is_safe() and self._is_enough(chosen)
         if self._alone:
             return topology_action(self._space, chosen)
         return injecting_action(self._space, self._dispatch.choose(chosen), chosen)
@@ -65,6 +68,9 @@ class GreedyJoint:
     def ranking(self, most: int) -> Considered | None:
         """The topology actions with the least worst loading by the forecast, nothing being dispatched."""
         return self._topology.ranking(most)
+
+    def _is_safe(self) -> bool:
+        return bool(is_safe(self._opened(self._env.state), 0))
 
     def _is_enough(self, chosen: int) -> bool:
         return bool(worst_loading(self._env, topology_action(self._space, chosen)) < SAFE_RHO)

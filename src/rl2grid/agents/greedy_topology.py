@@ -15,6 +15,7 @@ from rl2grid.agents.recovery import Recovery
 from rl2grid.arrays import F64, Flags
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
+from rl2grid.handles import AsOpened
 from rl2grid.mdp.actions import WORD_BITS, ActionCatalogue, ActionKind, Masks, full_catalogue, mask_words
 from rl2grid.mdp.heuristics import SAFE_RHO, is_safe
 from rl2grid.mdp.state import GridState
@@ -59,6 +60,7 @@ class GreedyTopology:
             )
         base: Any = env.unwrapped
         self._env, self._space = base, env.action_space
+        self._opened: AsOpened[GridState] = AsOpened()
         self._recovery.bind(env)
         ids = np.arange(len(base.action_catalogue_ids)) if self._chosen is None else np.array(self._chosen)
         self._ids = ids.tolist()
@@ -74,7 +76,7 @@ class GreedyTopology:
     def choose(self) -> int:
         """The id of the best action; 0 where none is better than doing nothing."""
         self._loading: F64 | None = None
-        if is_safe(self._env.state, 0):
+        if is_safe(self._opened(self._env.state), 0):
             self._why = "while the grid is safe, it does what recovery does, if the forecast then stays safe"
             return self._recover()
         outcomes = self._env.what_if(self._ids)

@@ -16,8 +16,10 @@ from rl2grid.arrays import F64, I32, Flags
 from rl2grid.envs.outages_after_action import busbars_after
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
+from rl2grid.handles import AsOpened
 from rl2grid.mdp.actions import ActionCatalogue, ActionKind, full_catalogue, moved_elements
 from rl2grid.mdp.heuristics import is_safe
+from rl2grid.mdp.state import GridState
 from rl2grid.powerflow.model import load_network
 
 _NOTHING = 0
@@ -72,6 +74,7 @@ class Milp:
             )
         base: Any = env.unwrapped
         self._env, self._space = base, env.action_space
+        self._opened: AsOpened[GridState] = AsOpened()
         self._grid: Grid = base.grid
         self._network = load_network(self._grid)
         self._catalogue = full_catalogue(self._grid).take(base.action_catalogue_ids)
@@ -89,7 +92,7 @@ class Milp:
         state = self._env.state
         on = state.topo_vect[0] > 0
         self._last_busbar[on] = state.topo_vect[0][on]
-        if is_safe(state, 0):
+        if is_safe(self._opened(state), 0):
             return _NOTHING
         point = dc_point(state, 0, self._grid, self._network)
         allowed: Flags = self._env.action_masks()

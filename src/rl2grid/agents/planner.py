@@ -20,6 +20,7 @@ from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.engines.native.what_if import WhatIf, forecast_of, snapshot_of
 from rl2grid.errors import UsageError, one_of
 from rl2grid.grids import Grid
+from rl2grid.handles import AsOpened
 from rl2grid.mdp.actions import ActionKind, continuous_layout, full_catalogue
 from rl2grid.mdp.heuristics import is_safe
 from rl2grid.mdp.state import GridState
@@ -102,6 +103,7 @@ class Planner:
         if not isinstance(base.engine, NativeEngine):
             raise UsageError("Agent 'planner' asks what-ifs of the native engine: choose engine=\"native\".")
         self._env, self._space = base, env.action_space
+        self._opened: AsOpened[GridState] = AsOpened()
         self._grid: Grid = base.grid
         self._what_if = WhatIf(self._grid)
         self._search: TopologySearch | None = None
@@ -160,7 +162,7 @@ class Planner:
             self._is_plan_void |= topology_part(played) != self._topology
 
     def _moment(self, state: GridState) -> _Moment:
-        return _Moment(state, is_safe(state, 0), forecast_of(self._env.engine, 0))
+        return _Moment(state, is_safe(self._opened(state), 0), forecast_of(self._env.engine, 0))
 
     def _is_calm(self, moment: _Moment) -> bool:
         """Whether nothing has to be done by the forecast."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from rl2grid.agents.agent import Action, Info, Observation, has_topology_actions, topology_action
 from rl2grid.errors import UsageError
+from rl2grid.handles import AsOpened
 from rl2grid.mdp.actions import ActionKind, full_catalogue
 from rl2grid.mdp.heuristics import is_safe, recovery_action
 from rl2grid.mdp.state import GridState
@@ -39,6 +40,7 @@ class Recovery:
             )
         base: Any = env.unwrapped
         self._env, self._space = base, env.action_space
+        self._opened: AsOpened[GridState] = AsOpened()
         actions = full_catalogue(base.grid).take(base.action_catalogue_ids)
         keys = zip(actions.kind.tolist(), actions.target.tolist(), actions.masks(), strict=True)
         self._action = {key: action for action, key in enumerate(keys)}
@@ -53,9 +55,10 @@ class Recovery:
     def choose(self) -> int:
         """The id of the heuristic's action, 0 where it would idle or the task lacks that action."""
         state: GridState = self._env.state
-        if not is_safe(state, 0):
+        opened = self._opened(state)
+        if not is_safe(opened, 0):
             return _NOTHING
-        kind, target = recovery_action(state, 0)
+        kind, target = recovery_action(opened, 0)
         if kind == ActionKind.RECONNECT:
             return self._action.get((int(ActionKind.SWITCH), int(target), 0), _NOTHING)
         if kind == ActionKind.RESTORE:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 from rl2grid.engines.action_effects import clipping, refusal
 from rl2grid.engines.base import Engine
+from rl2grid.handles import AsOpened
 from rl2grid.mdp.accumulate import accrue, begin_episode, begin_transition, end_reset
 from rl2grid.mdp.actions import DO_NOTHING, ActionKind, StepAction, one_change
 from rl2grid.mdp.features import changes_topology
@@ -50,11 +51,22 @@ class Transitions:
     listeners: list[Listener] = field(default_factory=list)
     action_effects: dict[int, str] = field(default_factory=dict)
     """By row: what was refused or clipped of the agent's last action."""
+    _opened: AsOpened[GridState] = field(default_factory=AsOpened)
+    _opened_result: AsOpened[GridState] = field(default_factory=AsOpened)
+
+    @property
+    def opened_state(self) -> GridState:
+        """The engine's state, for compiled functions."""
+        return self._opened(self.engine.state)
+
+    def opened_result(self, result: GridState) -> GridState:
+        """What :meth:`simulate` returned, for compiled functions."""
+        return self._opened_result(result)
 
     def reset(self, i: int, plan: EpisodePlan) -> None:
         """Begin an episode and play to its first decision."""
-        state = self.engine.state
         self.engine.reset(i, plan)
+        state = self.opened_state
         self.action_effects[i] = ""
         begin_episode(state, i)
         remember_nothing(state, i)
@@ -69,7 +81,7 @@ class Transitions:
         The flags ``illegal`` and ``ambiguous`` keep what happened to the agent's own action.
         """
         state = self.engine.state
-        begin_transition(state, i)
+        begin_transition(self.opened_state, i)
         state.decisions[i] += 1
         refused = refusal(self.engine.grid, verdict_on(state, i, action))
         self._step(i, action)
@@ -82,15 +94,16 @@ class Transitions:
     def simulate(self, i: int, action: StepAction, horizon: int) -> GridState:
         """``action`` played on the forecast, without heuristic: row 0 holds what one step would bring."""
         result = self.engine.simulate(i, action, horizon)
-        begin_episode(result, 0)
-        self._accrue(result, 0)
+        opened = self.opened_result(result)
+        begin_episode(opened, 0)
+        self._accrue(result, opened, 0)
         return result
 
     def _play_heuristic(self, i: int) -> None:
         state = self.engine.state
         if self.heuristic is None:
             return
-        while not (state.terminated[i] or state.truncated[i]) and is_safe(state, i):
+        while not (state.terminated[i] or state.truncated[i]) and is_safe(self.opened_state, i):
             self._step(i, self._heuristic_action(i))
 
     def _heuristic_action(self, i: int) -> StepAction:
@@ -99,24 +112,24 @@ class Transitions:
         if self.heuristic == "careful":
             return self._careful_action(i)
         decide = recovery_action if changes_topology(self.kind) else reconnect_action
-        kind, target = decide(self.engine.state, i)
+        kind, target = decide(self.opened_state, i)
         return one_change(kind, target)
 
     def _careful_action(self, i: int) -> StepAction:
         """The first candidate that the forecast allows; else nothing."""
-        state = self.engine.state
+        state, opened = self.engine.state, self.opened_state
         end = state.line_status.shape[1] + (len(state.sub_info) if changes_topology(self.kind) else 0)
-        candidate = careful_candidate(state, i, 0)
+        candidate = careful_candidate(opened, i, 0)
         while 0 <= candidate < end:
-            action = one_change(*candidate_action(state, candidate))
-            if is_careful_enough(self.engine.simulate(i, action, 1), 0):
+            action = one_change(*candidate_action(opened, candidate))
+            if is_careful_enough(self.opened_result(self.engine.simulate(i, action, 1)), 0):
                 return action
-            candidate = careful_candidate(state, i, candidate + 1)
+            candidate = careful_candidate(opened, i, candidate + 1)
         return DO_NOTHING
 
     def _remember(self, i: int) -> None:
         if self.heuristic == "careful":
-            remember_topology(self.engine.state, i)
+            remember_topology(self.opened_state, i)
 
     def _remember_moves(self, i: int, action: StepAction) -> None:
         """Note the substations that the agent has changed."""
@@ -125,17 +138,18 @@ class Transitions:
             return
         for change in action.changes:
             if change.kind == ActionKind.MOVE:
-                remember_move(state, i, change.target)
+                remember_move(self.opened_state, i, change.target)
 
     def _step(self, i: int, action: StepAction) -> None:
         self.engine.step(i, action)
-        self._accrue(self.engine.state, i)
+        self._accrue(self.engine.state, self.opened_state, i)
         self._remember(i)
         self._announce(i)
 
-    def _accrue(self, state: GridState, i: int) -> None:
-        survive, overload, cost = self.reward.components(state, i)
-        accrue(state, i, survive, overload, cost, self.reward.weights, self.gamma)
+    def _accrue(self, state: GridState, opened: GridState, i: int) -> None:
+        """Add up a grid step; a reward of the user is given the state itself."""
+        survive, overload, cost = self.reward.components(opened if self.reward.is_preset else state, i)
+        accrue(opened, i, survive, overload, cost, self.reward.weights, self.gamma)
 
     def _announce(self, i: int) -> None:
         for listener in self.listeners:

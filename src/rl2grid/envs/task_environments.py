@@ -153,7 +153,7 @@ class TaskEnvironments:
 
     def write_observation(self, i: int, out: NDArray[np.float32]) -> None:
         """Write the observation of row ``i`` to ``out``, float32 [feature]."""
-        self._observe(self.state, i, out)
+        self._observe(self.transitions.opened_state, i, out)
 
     def observe(self, i: int, scaled: bool) -> dict[str, NDArray[np.float32]]:
         """The observation of row ``i`` by name; see :meth:`rl2grid.envs.row_view.RowMethods.observe`."""
@@ -162,7 +162,7 @@ class TaskEnvironments:
         if scaled:
             self.write_observation(i, values)
         else:
-            self._write_observation(self.state, i, values)
+            self._write_observation(self.transitions.opened_state, i, values)
         return {name: values[part] for name, part in feature_slices(self.grid, self.task.kind).items()}
 
     def reward(self, i: int) -> float:
@@ -186,7 +186,7 @@ class TaskEnvironments:
     def write_action_mask(self, i: int, out: NDArray[np.bool_]) -> None:
         """Write to ``out`` [action] which topology actions are legal in row ``i``."""
         catalogue = self._topology_catalogue()
-        legal_actions(self.state, i, catalogue.kind, catalogue.target, out)
+        legal_actions(self.transitions.opened_state, i, catalogue.kind, catalogue.target, out)
 
     def _topology_catalogue(self) -> ActionCatalogue:
         if self._catalogue is None:
@@ -203,7 +203,7 @@ class TaskEnvironments:
         effect = refusal(self.grid, verdict_on(self.state, i, played))
         result = self.transitions.simulate(i, played, horizon)
         observation = np.zeros(observation_size(self.grid, self.task.kind), np.float32)
-        self._observe(result, 0, observation)
+        self._observe(self.transitions.opened_result(result), 0, observation)
         info = {**_start_info(plan), **episode_info(result, 0, self.constraint)}
         info["action_effect"] = effect or clipping(self.grid, result, 0, played)
         reward = float(result.transition_reward[0])

@@ -164,6 +164,6 @@ def _cost(player: NativeTransitions, plan: EpisodePlan, grid: Grid) -> Operation
     player.reset(0, plan)
     state = player.engine.state
     while not (state.terminated[0] or state.truncated[0]):
-        action = one_change(*reconnect_action(state, 0)) if player.heuristic == "recovery" else DO_NOTHING
+        action = one_change(*reconnect_action(player.opened_state, 0)) if player.heuristic == "recovery" else DO_NOTHING
         player.play(0, action)
     return asdict(operation_of(state, 0, grid.id, plan))

@@ -68,6 +68,11 @@ class RewardFunction:
     weights: Components
     """Weights of the three components in the reward."""
 
+    @property
+    def is_preset(self) -> bool:
+        """Whether the components are those of one of :data:`PRESETS`, compiled with the package."""
+        return any(self.components is preset.components for preset in PRESETS.values())
+
 
 @jit
 def default_components(state: GridState, i: int) -> Components:

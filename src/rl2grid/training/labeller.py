@@ -29,8 +29,10 @@ from rl2grid.arrays import F32, F64, I64, Flags
 from rl2grid.envs.description import step_action, task_catalogue
 from rl2grid.envs.tasks import Task
 from rl2grid.evaluation.reasons import explanation_of
+from rl2grid.handles import AsOpened
 from rl2grid.mdp.actions import INJECTION
 from rl2grid.mdp.heuristics import is_safe
+from rl2grid.mdp.state import GridState
 from rl2grid.records.labels import COMPLETED, GAME_OVER, NO_CANDIDATE, WENT_ON, Labels
 from rl2grid.streams import Purpose, Stream
 
@@ -86,6 +88,7 @@ class Labeller:
         """
         base: Any = env.unwrapped
         self._env, self._space = base, env.action_space
+        self._opened: AsOpened[GridState] = AsOpened()
         self._catalogue = task_catalogue(self._task, base.grid)
         self._teacher.bind(env)
         if self._pupil is not None:
@@ -114,7 +117,7 @@ class Labeller:
         action = self._legal(self._teacher.act(observation, info))
         acts, by_pupil = intervenes(action), self._pupil_acts()
         self.acted += acts
-        asks_for_something = acts or not is_safe(self._env.state, 0)
+        asks_for_something = acts or not is_safe(self._opened(self._env.state), 0)
         drawn = bool(self._thinning.uniform(1)[0] * self._thin < 1.0)
         if asks_for_something or drawn:
             self._keep(observation, action, 1.0 if asks_for_something else self._thin, by_pupil)
