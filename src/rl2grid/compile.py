@@ -34,8 +34,8 @@ INTERPRETED_LAYERS = (
 """Subpackages without compiled functions: an edit of them leaves the compiled ones what they are."""
 
 INTERPRETED_MODULES = (
-    "__init__.py", "__main__.py", "benchmark.py", "compile_locks.py", "compile_notices.py",
-    "errors.py", "processes.py",
+    "__init__.py", "__main__.py", "benchmark.py", "compile_beside.py", "compile_locks.py", "compile_notices.py",
+    "errors.py", "processes.py", "engines/native/compile_ahead.py",
 )  # fmt: skip
 """Modules beside compiled functions nothing of which they use: what takes part in an import, says something, or starts
 processes."""

@@ -28,6 +28,7 @@ from rl2grid.engines.native.advance import (
     write_observations,
 )
 from rl2grid.engines.native.beginning import Draws
+from rl2grid.engines.native.compile_ahead import compile_ahead
 from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.engines.native.entry import reset_rows
 from rl2grid.engines.native.threads import Threads
@@ -202,6 +203,8 @@ class NativeTransitions(Transitions):
         self._rows = np.arange(n)
         self._no_effects = np.full(n, "", object)
         self._nothing = commands_of(self.engine.grid, [DO_NOTHING] * n)
+        if self.is_compiled:
+            compile_ahead()
 
     @property
     def is_compiled(self) -> bool:
