@@ -6,26 +6,9 @@ import pytest
 
 pytest.importorskip("mkdocs")
 
-from documentation import ROOT
-from mkdocs.commands.build import build
-from mkdocs.config import load_config
-
 from rl2grid.envs.options import OPTION_NAMES
 
 FETCHED = re.compile(r"""<(?:script|link|img)\b[^>]*?(?:src|href)=["']?(https?:[^"'\s>]+)""")
-
-
-@pytest.fixture(scope="module")
-def site(tmp_path_factory):
-    """A folder with the site, built strictly: a broken link or anchor is an error."""
-    folder = tmp_path_factory.mktemp("site")
-    config = load_config(str(ROOT / "mkdocs.yml"), site_dir=str(folder), strict=True)
-    config.plugins.on_startup(command="build", dirty=False)
-    try:
-        build(config)
-    finally:
-        config.plugins.on_shutdown()
-    return folder
 
 
 def test_no_page_fetches_anything(site):
