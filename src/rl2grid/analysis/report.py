@@ -187,5 +187,7 @@ nav { display: flex; flex-wrap: wrap; gap: .4rem 1.2rem; margin-top: 1.25rem; }
 h3 { font-size: 1rem; margin: 1.75rem 0 .5rem; }
 section > figure { max-width: 60rem; }
 td.links { max-width: 12rem; min-width: 4rem; white-space: normal; }
+.typed td.words, .typed tr:last-child th { white-space: normal; }
+.typed td.words:not(.links) { min-width: 6.2rem; }
 @media (max-width: 40rem) { .scroll td:first-child { min-width: 5.5rem; white-space: normal; } }
 """
