@@ -111,6 +111,15 @@ def _plain(text: str) -> str:
     return " ".join(_LITERAL.sub(r"\1", text).split())
 
 
+class UnknownKeywordError(UsageError, TypeError):
+    """A keyword that does not exist.
+
+    It is Python's error for one as well, with its words: libraries offer keywords of their own to every environment,
+    and try again without the one that is named as unexpected, as TorchRL does with ``frameskip``. Gymnasium puts words
+    of its own behind the sentence.
+    """
+
+
 def options_of(task: Task, keywords: Mapping[str, Any], allowed: Iterable[str] = OPTION_NAMES) -> TaskOptions:
     """The options of environments of ``task`` that are made with ``keywords``.
 
@@ -120,11 +129,13 @@ def options_of(task: Task, keywords: Mapping[str, Any], allowed: Iterable[str] =
         allowed: names that messages offer.
 
     Raises:
-        UsageError: a keyword does not exist, has a value that is not allowed, or contradicts the task.
+        UnknownKeywordError: a keyword does not exist.
+        UsageError: a keyword has a value that is not allowed, or contradicts the task.
     """
     for name in keywords:
         if name not in OPTION_NAMES:
-            raise one_of("Keyword", name, tuple(allowed))
+            choices = ", ".join(allowed)
+            raise UnknownKeywordError(f"There is an unexpected keyword argument {name!r}: choose one of {choices}.")
     options = TaskOptions(**keywords)
     if keywords.get("opponent") and task.grid.opponent.kind == "none":
         raise UsageError(f"opponent=True is not allowed: {task.grid_id} has no opponent; leave it out.")
