@@ -229,6 +229,7 @@ def test_a_poor_trial_is_ended_by_its_validation_survival(tmp_path: Path, monkey
     file = {**SEARCH, "trials": 6, "months": 1, "validations": 2, "seeds": [1]}
     file["space"] = {"initial_do_nothing": [cautious, rash]}
     tuning = parse_tuning({**file, "hyperparameters": {"actor_learning_rate": 1e-6}}, tmp_path)
+    _prepare(tuning)
     # Nothing is ended before five trials are complete; equal ones cost one training.
     for choice in (*[cautious] * 5, rash):
         _open(tuning).enqueue_trial({"initial_do_nothing": choice})
