@@ -16,7 +16,9 @@ from rl2grid.agents.planner import Planner
 from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.engines.worlds import World
 from rl2grid.errors import UsageError
+from rl2grid.handles import AsOpened
 from rl2grid.mdp.heuristics import is_safe
+from rl2grid.mdp.state import GridState
 
 _EARLIER = (1, 3, 6, 12, 24, 48)
 """Decisions before the grid became unsafe at which something else is tried as well."""
@@ -87,6 +89,7 @@ class Foresight:
             raise UsageError(f'Agent {self.name!r} asks what-ifs of the native engine: choose engine="native".')
         self._present = base
         self._future: Any = copy.deepcopy(base)
+        self._opened: AsOpened[GridState] = AsOpened()
         self._guide.bind(self._future)
 
     def reset(self, i: int) -> None:
@@ -188,7 +191,7 @@ class Foresight:
         lost = False
         while not over and (most is None or len(decisions) < most) and (until is None or int(state.step[0]) < until):
             before = future.save() if decisions else world
-            step, safe = int(state.step[0]), is_safe(state, 0)
+            step, safe = int(state.step[0]), is_safe(self._opened(state), 0)
             action = first if first is not None and not decisions else int(self._guide.act(observation, info))
             observation, _, lost, completed, info = future.step(action)
             decisions.append(_Decision(before, step, safe, action))
