@@ -111,10 +111,10 @@ def test_dqn_balances_the_pole():
         batch_size=64,
         reward_scale=1.0,
         learning_rate=1e-3,
-        target_frequency=500,
+        target_frequency=250,
         first_epsilon=1.0,
         last_epsilon=0.04,
         epsilon_decay_fraction=0.16,
     )
-    # The last policy, not the best: DQN's rises and falls. Seeds 1, 2, 3: 446, 185, 500.
+    # The last policy, not the best: DQN's rises and falls. Seeds 1, 2, 3, 4: 500, 500, 251, 500.
     assert mean_return(dqn.DQN(args, cartpole(8)), cartpole(10)) > 150.0
