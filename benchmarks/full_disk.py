@@ -4,8 +4,8 @@
 ``kills.py``, and what writes pictures and pages) run once on a disk of memory with room enough. Then it runs on disks
 that are full after a number of bytes drawn from what it took. It must end with a sentence that says so, without a
 traceback and not by a signal. Then the disk gets room, and what is called again must leave what was left the first
-time. Writes ``benchmarks/results/full_disk.json``, where a subject stays as it was until it is
-played by another command. Linux, in a name space of its own (``unshare``), without privileges.
+time. Writes ``benchmarks/results/full_disk.json``, where a subject stays as it was until it is played by another
+command. Linux, in a name space of its own (``unshare``), without privileges.
 """
 
 from __future__ import annotations
