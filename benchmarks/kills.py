@@ -101,11 +101,17 @@ def _training(algorithm: str) -> Subject:
     def first(folder: Path) -> list[str]:
         return ["train", algorithm, task, "--output", str(folder / "run"), *OFTEN, *sizes]
 
+    return Subject(f"train {algorithm}", first, _resumed(first), _trained)
+
+
+def _resumed(first: Callable[[Path], list[str]]) -> Callable[[Path], list[str]]:
+    """The command that goes on with a training, or begins it where nothing was written."""
+
     def again(folder: Path) -> list[str]:
         known = (folder / "run" / "config.json").exists()
         return ["train", "--resume", str(folder / "run")] if known else first(folder)
 
-    return Subject(f"train {algorithm}", first, again, _trained)
+    return again
 
 
 def _imitation(folder: Path) -> list[str]:
@@ -114,11 +120,6 @@ def _imitation(folder: Path) -> list[str]:
     if not labels.exists():
         subprocess.run([*PROGRAM, *LABELS, "--output", str(labels)], check=True, capture_output=True)
     return ["train", "imitation", *IMITATION, "--labels", str(labels), "--output", str(folder / "run")]
-
-
-def _imitation_again(folder: Path) -> list[str]:
-    known = (folder / "run" / "config.json").exists()
-    return ["train", "--resume", str(folder / "run")] if known else _imitation(folder)
 
 
 def _trained(folder: Path) -> Any:
@@ -197,7 +198,7 @@ def _compilation(folder: Path) -> list[str]:
 
 SUBJECTS = (
     *map(_training, TRAININGS),
-    Subject("train imitation", _imitation, _imitation_again, _trained),
+    Subject("train imitation", _imitation, _resumed(_imitation), _trained),
     Subject("evaluate", _evaluation, _evaluation, _evaluated),
     Subject("teach", _teaching, _teaching, _labelled),
     Subject("study", _study, _study, _studied),

@@ -28,6 +28,15 @@ def survived(agent: Any) -> Any:
     return result.episodes[0]
 
 
+def begun(agent: Foresight) -> tuple[Any, Any, Any]:
+    """An environment that the agent plays, with what its reset returned."""
+    env: Any = gymnasium.make("rl2grid/bus14-T0-v0", split="bundled")
+    agent.bind(env)
+    observation, info = env.reset(seed=0, options={"scenario": MONTH})
+    agent.reset(0)
+    return env, observation, info
+
+
 def test_it_outlives_its_guide_and_is_marked():
     guided, alone = survived(foresight()), survived(DoNothing())
     assert guided.grid_steps > alone.grid_steps
@@ -35,11 +44,8 @@ def test_it_outlives_its_guide_and_is_marked():
 
 
 def test_what_it_plays_is_what_it_foresaw():
-    env: Any = gymnasium.make("rl2grid/bus14-T0-v0", split="bundled")
     agent = foresight()
-    agent.bind(env)
-    observation, info = env.reset(seed=0, options={"scenario": MONTH})
-    agent.reset(0)
+    env, observation, info = begun(agent)
     over = False
     while not over and info["step"] < 150:
         action = agent.act(observation, info)
@@ -50,11 +56,8 @@ def test_what_it_plays_is_what_it_foresaw():
 
 
 def test_it_forgets_the_future_of_an_action_that_was_not_played():
-    env: Any = gymnasium.make("rl2grid/bus14-T0-v0", split="bundled")
     agent = foresight()
-    agent.bind(env)
-    observation, info = env.reset(seed=0, options={"scenario": MONTH})
-    agent.reset(0)
+    env, observation, info = begun(agent)
     agent.act(observation, info)
     agent.overruled(7)
     observation, *_, info = env.step(7)

@@ -37,8 +37,11 @@ class Subject:
     """How it came to be: command, decisions, minutes; empty without training."""
     last: Path | None = None
     """The checkpoint of the last policy; None where that is the best one, or nothing was trained."""
-    top_k: int | None = None
-    """Of how many of the policy's best actions the what-if chooses; None: it plays its best."""
+
+    @property
+    def top_k(self) -> int | None:
+        """Of how many of the policy's best actions the what-if chooses; None: it plays its best."""
+        return self.configuration.get("top_k")
 
     @property
     def digest(self) -> str:
@@ -85,7 +88,7 @@ def find_subject(text: str, months: int | None = None, top_k: int | None = None)
     if top_k is None:
         return subject
     make_agent(subject.agent, subject.task, top_k=top_k)  # refuses agents that have no best actions
-    return replace(subject, configuration={**subject.configuration, "top_k": top_k}, top_k=top_k)
+    return replace(subject, configuration={**subject.configuration, "top_k": top_k})
 
 
 def count_look(subject: Subject, results: Mapping[str, HashedTest]) -> str:
