@@ -59,11 +59,17 @@ def event(*, start: bool, module: str = "rl2grid.engines.native.advance") -> Any
     return SimpleNamespace(is_start=start, data={"dispatcher": dispatcher})
 
 
-def test_a_long_compilation_says_how_far_it_is(monkeypatch: pytest.MonkeyPatch):
-    said: list[str] = []
+@pytest.fixture
+def said(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """What is said; every look at the clock is six seconds after the last one."""
+    words: list[str] = []
     clock = iter(range(0, 1000, 6))
-    monkeypatch.setattr(compile_notices, "say", said.append)
+    monkeypatch.setattr(compile_notices, "say", words.append)
     monkeypatch.setattr(compile_notices.time, "monotonic", lambda: next(clock))
+    return words
+
+
+def test_a_long_compilation_says_how_far_it_is(said: list[str]):
     notices = compile_notices.Notices()
     notices.notify(event(start=True))
     for _ in range(3):
@@ -83,11 +89,7 @@ def test_a_long_compilation_says_how_far_it_is(monkeypatch: pytest.MonkeyPatch):
     ]
 
 
-def test_who_waits_for_another_process_says_so(monkeypatch: pytest.MonkeyPatch):
-    said: list[str] = []
-    clock = iter(range(0, 1000, 6))
-    monkeypatch.setattr(compile_notices, "say", said.append)
-    monkeypatch.setattr(compile_notices.time, "monotonic", lambda: next(clock))
+def test_who_waits_for_another_process_says_so(said: list[str]):
     notices = compile_notices.Notices()
     notices.wait("mine")
     for _ in range(3):
