@@ -49,10 +49,11 @@ print(outer(1), Counter.compiled)
 
 def start(folder: Path, seconds: float, cache: Path | None = None) -> subprocess.Popen[str]:
     """A process whose compilation of each of two functions takes so long at least."""
-    script = folder / "script.py"  # machine code belongs to a file and its content
     slow = folder / "seconds.txt"
     slow.write_text(str(seconds))
-    script.write_text(SCRIPT.format(seconds=f"float(open({str(slow)!r}).read())"))
+    script = folder / "script.py"  # machine code belongs to a file and its content
+    if not script.exists():  # another process may be reading it
+        script.write_text(SCRIPT.format(seconds=f"float(open({str(slow)!r}).read())"))
     variables = {name: value for name, value in os.environ.items() if name != compile_notices.VARIABLE}
     variables["XDG_CACHE_HOME"] = str(cache or folder / "cache")
     pipe = subprocess.PIPE
