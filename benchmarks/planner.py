@@ -5,7 +5,7 @@ plays the first N validation months of each task (after the first ``--skip``), b
 planner, with the agents of ``--against``, and, with ``--without``, with the planner without each of its ingredients. It
 writes ``benchmarks/results/planner.json``, one row per task and agent: survival with its interval, paired difference to
 the planner, share of completed months, milliseconds of a decision (mean, 99 of 100, the slowest), how episodes ended
-and which lines were overloaded then. Tasks that were measured before stay.
+and which lines were overloaded then. Tasks and heuristics that were measured before stay.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def main() -> None:
             "rows": compare(task, months, agents, arguments.heuristic),
         }
         results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
-        results[short_id(task.id)] = result
+        results[" ".join((short_id(task.id), *([arguments.heuristic] if arguments.heuristic else [])))] = result
         write_json(RESULTS, results)
 
 

@@ -125,7 +125,8 @@ def test_beyond_the_forecasts_the_trend_goes_on():
     gens = continuous_layout(env.grid).redispatch
     forecast = np.zeros((1, env.grid.n_gen), np.float32)
     forecast[0, gens] = 50.0
-    for value in (40.0, 42.0, 44.0):
+    for step, value in ((1, 90.0), (8, 40.0), (10, 44.0)):  # the first is too long ago
+        env.state.step[0] = step
         env.state.gen_p[0][gens] = value
         dispatch.watch(env.state)
     series = dispatch.foreseen(env.state, forecast)

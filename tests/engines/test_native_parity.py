@@ -105,7 +105,7 @@ def _long_tally(grid_id):
     return compare(grid_id, "mixed", "adversarial", steps=3000, seed=4)
 
 
-@pytest.mark.parametrize("heuristic", ["idle", "recovery", "careful"])
+@pytest.mark.parametrize("heuristic", ["idle", "recovery", "careful", "secure"])
 @pytest.mark.parametrize("grid_id", ["bus14", "bus36-MO-v0", "bus118-MOB-v1"])
 def test_transitions_agree(grid_id, heuristic):
     """With the heuristic deciding on each engine's own state, transitions have the same length and sums."""
@@ -321,7 +321,7 @@ def test_unknown_probes_are_refused():
         make_probe(load_grid("bus14"), "topology", "evil")
 
 
-@pytest.mark.parametrize("heuristic", ["recovery", "careful"])
+@pytest.mark.parametrize("heuristic", ["recovery", "careful", "secure"])
 def test_transitions_are_compared_and_a_heuristic_that_differs_is_found(heuristic):
     reference, native = engines("bus36-MO-v0", "exact")
 

@@ -20,7 +20,7 @@ from rl2grid.mdp.rewards import default_components
 from rl2grid.scenarios.library import list_scenarios, load_scenario
 
 TASKS = ("bus14-T0", "bus14-R", "bus118-MOB-v1-T0", "bus118-MOB-v1-R")
-HEURISTICS = (None, "idle", "recovery", "careful")
+HEURISTICS = (None, "idle", "recovery", "careful", "secure")
 TOLERANCE = 1e-4
 """Of features divided by their physical scale, and of rewards of a grid step: the engines solve the flow to 1e-6."""
 

@@ -12,6 +12,7 @@ import numpy as np
 from random_states import random_state
 
 from rl2grid.grids import load_grid
+from rl2grid.handles import AsOpened
 from rl2grid.mdp.accumulate import accrue, begin_episode, begin_transition
 from rl2grid.mdp.constraints import lsi_cost, tlo_cost, update_excused
 from rl2grid.mdp.features import observation_size
@@ -27,7 +28,9 @@ from rl2grid.mdp.heuristics import (
 from rl2grid.mdp.observations import observation_writer
 from rl2grid.mdp.rewards import PRESETS
 from rl2grid.mdp.scores import margin_score, overload_score, topology_score
+from rl2grid.mdp.security import loading_after_loss, new_security
 from rl2grid.mdp.termination import game_over_reason
+from rl2grid.powerflow.model import load_network
 
 ROWS = 12
 SCALARS = (
@@ -60,6 +63,7 @@ def evaluate():
                 observation_writer(kind)(state, i, observations[i])
             results[f"{grid_id} observation {kind}"] = observations
         results[f"{grid_id} careful"] = np.array([_remember(state, i) for i in range(ROWS)])
+        results[f"{grid_id} losses"] = np.array([_lose(grid, state, i) for i in range(0, ROWS, 6)])
         _accumulate(state)
         for name, array in zip(state._fields, state, strict=True):
             results[f"{grid_id} state {name}"] = array
@@ -72,6 +76,14 @@ def _remember(state, i):
     for sub in range(0, len(state.sub_info), 3):
         remember_move(state, i, sub)
     return [careful_candidate(state, i, begin) for begin in (0, state.rho.shape[1])]
+
+
+def _lose(grid, state, i):
+    """Worst loadings after the loss of lines."""
+    security = new_security(grid, load_network(grid), attacks=True)
+    opened, state_opened = AsOpened()(security), AsOpened()(state)
+    lines = enumerate(security.line[:3])
+    return [loading_after_loss(opened, state_opened, i, k) if state.line_status[i, line] else 0.0 for k, line in lines]
 
 
 def _accumulate(state):

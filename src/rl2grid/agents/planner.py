@@ -119,7 +119,7 @@ class Planner:
         """Forget the series of the last episode."""
         self._why = ""
         self._planned: F64 | None = None
-        self._age = 0
+        self._age, self._step = 0, 0
         self._compared: list[tuple[int, float]] = []
         self._topology, self._is_plan_void = NOTHING, False
         if self._dispatch is not None:
@@ -131,6 +131,8 @@ class Planner:
         self._why, self._compared = "", []
         if self._dispatch is not None:
             self._dispatch.watch(state)
+        self._is_plan_void |= int(state.step[0]) > self._step + 1  # a heuristic played between
+        self._step = int(state.step[0])
         action = self._choose(self._moment(state))
         if self._search is not None:
             self._topology = topology_part(action)

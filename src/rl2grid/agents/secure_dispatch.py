@@ -103,7 +103,7 @@ class SecureDispatch:
         self._grid, self._network, self._what_if = grid, network, what_if
         self._layout = continuous_layout(grid)
         self._positions = control_positions(grid)
-        self._history: list[F64] = []
+        self._history: list[tuple[int, F64]] = []
         self._tables: dict[bytes, F64] = {}
 
     def reset(self) -> None:
@@ -111,9 +111,10 @@ class SecureDispatch:
         self._history.clear()
 
     def watch(self, state: GridState) -> None:
-        """Remember what the generators produce by the series; once a step."""
-        self._history.append(self._series_now(state))
-        del self._history[: -_TREND - 1]
+        """Remember what the generators produce by the series; at most once a step."""
+        step = int(state.step[0])
+        self._history.append((step, self._series_now(state)))
+        self._history = [moment for moment in self._history if moment[0] >= step - _TREND]
 
     def foreseen(self, state: GridState, forecast: F32) -> Series:
         """The series of the redispatchable generators, now and at the horizons of the programme.
@@ -126,7 +127,8 @@ class SecureDispatch:
         now, gens = self._series_now(state), self._layout.redispatch
         trend = np.zeros(len(gens))
         if len(self._history) > 1:
-            trend = (self._history[-1] - self._history[0]) / (len(self._history) - 1)
+            (first, before), (last, after) = self._history[0], self._history[-1]
+            trend = (after - before) / (last - first)
         known = forecast[:, gens].astype(np.float64)
         least, most = np.minimum(state.gen_pmin[gens], now), np.maximum(state.gen_pmax[gens], now)
         ahead = [

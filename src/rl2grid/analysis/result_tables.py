@@ -31,7 +31,7 @@ from rl2grid.records.statistics import (
     optimality_gap,
 )
 
-HEURISTIC_LETTERS: dict[str, str] = {"none": "V", "idle": "I", "recovery": "R", "careful": "C"}
+HEURISTIC_LETTERS: dict[str, str] = {"none": "V", "idle": "I", "recovery": "R", "careful": "C", "secure": "S"}
 """The paper's, vanilla, idle and recovery; and careful."""
 AGGREGATES: dict[str, Aggregate] = {
     "mean": mean_score,

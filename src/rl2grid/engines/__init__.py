@@ -3,8 +3,8 @@
 ENGINES: tuple[str, ...] = ("native", "reference")
 """Engines by name: ``native`` is ours, compiled; ``reference`` is Grid2Op with LightSim2Grid."""
 
-HEURISTICS: tuple[str, ...] = ("idle", "recovery", "careful")
-"""What may play while the grid is safe; without one, the agent decides every step."""
+HEURISTICS: tuple[str, ...] = ("idle", "recovery", "careful", "secure")
+"""What may play while the grid is safe (``secure``: and bears losses); without one, the agent decides every step."""
 
 DISPATCHES: tuple[str, ...] = ("exact", "grid2op")
 """How the redispatch problem of a step is solved; see ``docs/dispatch.md``."""

@@ -8,6 +8,7 @@ from rl2grid.engines.worlds import World
 from rl2grid.grids import Grid
 from rl2grid.mdp.actions import StepAction
 from rl2grid.mdp.state import GridState
+from rl2grid.powerflow.model import Network
 from rl2grid.scenarios.episodes import EpisodePlan
 
 
@@ -19,7 +20,10 @@ class Engine(Protocol):
     """
 
     grid: Grid
+    network: Network
     state: GridState
+    attacks: bool
+    """Whether the grid's opponent attacks."""
 
     def reset(self, i: int, plan: EpisodePlan) -> None:
         """Begin the episode ``plan`` in environment ``i``; its first row may already be a game over."""

@@ -26,6 +26,7 @@ from rl2grid.mdp.accumulate import accrue, begin_episode
 from rl2grid.mdp.actions import ActionKind, StepAction
 from rl2grid.mdp.heuristics import SAFE_RHO
 from rl2grid.mdp.rewards import PRESETS, RewardFunction
+from rl2grid.mdp.security import SAFE_LOADING
 from rl2grid.mdp.state import OBSERVED, OBSERVED_STORAGE, GridState
 from rl2grid.mdp.termination import GameOver
 from rl2grid.scenarios.episodes import EpisodePlan
@@ -75,7 +76,7 @@ not listed. The resolution of float32, 1.2e-7 of the value, is admitted on top o
 THRESHOLD, DIVERGENCE = "threshold", "divergence"
 OPPONENT_RANK, DISPATCH_SOLVER = "opponent rank", "dispatch solver"
 CAUSES: dict[str, str] = {
-    THRESHOLD: "a line is loaded within 1e-5 of the limit (1) or of the hard limit",
+    THRESHOLD: "a line is loaded within 1e-5 of the limit (1) or of the hard limit, or would be after a loss",
     DIVERGENCE: "the power flow of one engine did not converge, that of the other did",
     OPPONENT_RANK: "loadings equal to 1e-5 are ranked differently, so that another line is attacked",
     DISPATCH_SOLVER: "with dispatch='grid2op', SLSQP stopped at another dispatch for the same wish",
@@ -346,6 +347,16 @@ class TransitionsSideBySide(SideBySide):
     def _differs(self) -> bool:
         return super()._differs() or self._sums_differ()
 
+    def _explain(
+        self, comparison: _Comparison, j: int, attributes: set[str], before: NDArray[np.float32]
+    ) -> tuple[str, str]:
+        cause, evidence = super()._explain(comparison, j, attributes, before)
+        if cause or self._transitions[0].heuristic != "secure":
+            return cause, evidence
+        expected, actual = self._transitions
+        evidence = near_loss(expected, 0) or near_loss(actual, j)
+        return (THRESHOLD, evidence) if evidence else ("", "")
+
     def _sums_differ(self) -> bool:
         """Whether what adds up over the steps of a transition differs by more than its steps may."""
         (expected, actual), j = (self._expected.state, self._actual.state), self._row
@@ -365,7 +376,7 @@ class Detour:
 
     def __init__(self, engine: Engine, probe: Probe, every: int = 20, steps: int = 3) -> None:
         self._engine, self._probe, self._every, self._steps = engine, probe, every, steps
-        self.grid, self.state = engine.grid, engine.state
+        self.grid, self.network, self.attacks, self.state = engine.grid, engine.network, engine.attacks, engine.state
         self._played = 0
 
     def reset(self, i: int, plan: EpisodePlan) -> None:
@@ -415,6 +426,18 @@ def near_threshold(limits: tuple[float, ...], rho: NDArray[np.float32]) -> str:
         lines = np.flatnonzero(np.abs(rho.astype(np.float64) - threshold) < _NEAR)
         if len(lines):
             return f"line {lines[0]} is loaded {rho[lines[0]]:.8f}"
+    return ""
+
+
+def near_loss(transitions: Transitions, i: int) -> str:
+    """Which loss of a line that is expected in row ``i`` would load another within 1e-5 of the limit, in words."""
+    security, state = transitions.security, transitions.engine.state
+    for k, line in enumerate(security.line.tolist()):
+        if not (state.line_status[i, line] and transitions.expects_loss(i, k)):
+            continue
+        loading = transitions.loading_after_loss(i, k)
+        if abs(loading - SAFE_LOADING) < _NEAR:
+            return f"the loss of line {line} would load another {loading:.8f}"
     return ""
 
 

@@ -6,6 +6,7 @@ the heuristic to the first decision; what accrues there is kept apart, as no dec
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -28,6 +29,7 @@ from rl2grid.mdp.heuristics import (
 )
 from rl2grid.mdp.legality import verdict_on
 from rl2grid.mdp.rewards import RewardFunction
+from rl2grid.mdp.security import Security, is_expected, is_secure, loading_after_loss, new_security
 from rl2grid.mdp.state import GridState
 from rl2grid.scenarios.episodes import EpisodePlan
 
@@ -43,8 +45,8 @@ class Transitions:
     heuristic: str | None
     """One of :data:`rl2grid.engines.HEURISTICS`; None: the agent decides every step."""
     kind: str
-    """Of task, one of :data:`rl2grid.mdp.features.KINDS`: where agents have no topology actions, the heuristics
-    recovery and careful only reconnect lines."""
+    """Of task, one of :data:`rl2grid.mdp.features.KINDS`: where agents have no topology actions, heuristics
+    only reconnect lines."""
     reward: RewardFunction
     gamma: float
     """Discount between the grid steps of a transition."""
@@ -53,6 +55,7 @@ class Transitions:
     """By row: what was refused or clipped of the agent's last action."""
     _opened: AsOpened[GridState] = field(default_factory=AsOpened)
     _opened_result: AsOpened[GridState] = field(default_factory=AsOpened)
+    _opened_security: AsOpened[Security] = field(default_factory=AsOpened)
 
     @property
     def opened_state(self) -> GridState:
@@ -62,6 +65,16 @@ class Transitions:
     def opened_result(self, result: GridState) -> GridState:
         """What :meth:`simulate` returned, for compiled functions."""
         return self._opened_result(result)
+
+    @property
+    def looks_ahead(self) -> bool:
+        """Whether the heuristic tries things on forecasts."""
+        return self.heuristic in ("careful", "secure")
+
+    @functools.cached_property
+    def security(self) -> Security:
+        """What may be lost on the grid, for the heuristic that looks at it."""
+        return new_security(self.engine.grid, self.engine.network, self.engine.attacks)
 
     def reset(self, i: int, plan: EpisodePlan) -> None:
         """Begin an episode and play to its first decision."""
@@ -104,12 +117,30 @@ class Transitions:
         if self.heuristic is None:
             return
         while not (state.terminated[i] or state.truncated[i]) and is_safe(self.opened_state, i):
-            self._step(i, self._heuristic_action(i))
+            action = self._heuristic_action(i)
+            if not action.changes and self._asks(i):
+                break
+            self._step(i, action)
+
+    def _asks(self, i: int) -> bool:
+        """Whether the agent decides although the grid is safe, where the heuristic has nothing to do."""
+        return self.heuristic == "secure" and not self._is_secure(i, self.opened_state, i)
+
+    def expects_loss(self, i: int, k: int) -> bool:
+        """Whether the line of contingency ``k`` of :attr:`security` may be lost soon in row ``i``."""
+        return bool(is_expected(self._opened_security(self.security), self.opened_state, i, k))
+
+    def loading_after_loss(self, i: int, k: int) -> float:
+        """Largest loading in row ``i`` after the loss of the line of contingency ``k``, which is in service."""
+        return float(loading_after_loss(self._opened_security(self.security), self.opened_state, i, k))
+
+    def _is_secure(self, i: int, flows: GridState, j: int) -> bool:
+        return bool(is_secure(self._opened_security(self.security), self.opened_state, i, flows, j))
 
     def _heuristic_action(self, i: int) -> StepAction:
         if self.heuristic == "idle":
             return DO_NOTHING
-        if self.heuristic == "careful":
+        if self.looks_ahead:
             return self._careful_action(i)
         decide = recovery_action if changes_topology(self.kind) else reconnect_action
         kind, target = decide(self.opened_state, i)
@@ -122,19 +153,25 @@ class Transitions:
         candidate = careful_candidate(opened, i, 0)
         while 0 <= candidate < end:
             action = one_change(*candidate_action(opened, candidate))
-            if is_careful_enough(self.opened_result(self.engine.simulate(i, action, 1)), 0):
+            forecast = self.opened_result(self.engine.simulate(i, action, 1))
+            if is_careful_enough(forecast, 0) and self._keeps_secure(i, action, forecast):
                 return action
             candidate = careful_candidate(opened, i, candidate + 1)
         return DO_NOTHING
 
+    def _keeps_secure(self, i: int, action: StepAction, forecast: GridState) -> bool:
+        """Whether the heuristic may play this as far as losses are concerned."""
+        restores = action.changes[0].kind == ActionKind.RESTORE
+        return self.heuristic != "secure" or not restores or self._is_secure(i, forecast, 0)
+
     def _remember(self, i: int) -> None:
-        if self.heuristic == "careful":
+        if self.looks_ahead:
             remember_topology(self.opened_state, i)
 
     def _remember_moves(self, i: int, action: StepAction) -> None:
         """Note the substations that the agent has changed."""
         state = self.engine.state
-        if self.heuristic != "careful" or state.illegal[i] or state.ambiguous[i]:
+        if not self.looks_ahead or state.illegal[i] or state.ambiguous[i]:
             return
         for change in action.changes:
             if change.kind == ActionKind.MOVE:

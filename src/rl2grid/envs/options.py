@@ -54,7 +54,8 @@ class TaskOptions:
     engine: str = field(default="native", metadata=_one_of(*ENGINES))
     """``"native"``: ours, compiled; ``"reference"``: Grid2Op with LightSim2Grid."""
     heuristic: str | None = field(default=None, metadata=_one_of(None, *HEURISTICS))
-    """What plays while the grid is safe: ``"idle"``, ``"recovery"``, ``"careful"``; None: the agent always decides."""
+    """What plays while the grid is safe: ``"idle"``, ``"recovery"``, ``"careful"``; ``"secure"``: while it is safe and
+    would bear the loss of any line that may be lost; None: the agent always decides."""
     reward: str | tuple[float, float, float] | Callable[..., Any] = field(
         default="default",
         metadata={"flag": "default, paper or released, or the weights of the three components, such as 1,0.5,0"},

@@ -76,7 +76,7 @@ def evaluate(
         seeds: of maintenance, opponent and agent; each scenario has its own draws with the same seed
             (:func:`rl2grid.evaluation.episode.environment_seed`).
         start: row of each scenario at which its episodes begin.
-        heuristic: None, ``"idle"``, ``"recovery"``, ``"careful"`` or :data:`AS_TRAINED`.
+        heuristic: None, one of :data:`rl2grid.engines.HEURISTICS`, or :data:`AS_TRAINED`.
         workers: processes that play at the same time; 0: this process plays; None: this one for less than 100 episodes
             of the native engine, and for agents that are not given by name or path, else one per processor core. No
             influence on results.

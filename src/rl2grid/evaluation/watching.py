@@ -33,7 +33,7 @@ def play_to_watch(
         split: whose scenario is played.
         scenario: None: the first of the split.
         seed: of maintenance, opponent and agent.
-        heuristic: None, ``"idle"``, ``"recovery"``, ``"careful"``, or the one that the policy was trained with.
+        heuristic: None, one of :data:`rl2grid.engines.HEURISTICS`, or the one that the policy was trained with.
         steps: record no more grid steps than these.
         on_step: called after every grid step.
 

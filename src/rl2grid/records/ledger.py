@@ -67,7 +67,7 @@ class HashedTest:
 
     @property
     def heuristic(self) -> str | None:
-        """``"idle"``, ``"recovery"``, ``"careful"`` or None."""
+        """``"idle"``, ``"recovery"``, ``"careful"``, ``"secure"`` or None."""
         keywords = self.configuration.get("env_keywords", self.configuration)
         chosen: str | None = keywords["heuristic"]
         return chosen

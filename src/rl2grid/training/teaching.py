@@ -133,7 +133,7 @@ def teach(
         months: of the round; of one that is there already, as many or more.
         output: folder of the labels, that of an earlier call to go on with it; None: by task and teacher in ``runs``.
         seed: of which months are played, and which decisions are kept of those that ask for nothing.
-        heuristic: None, ``"idle"``, ``"recovery"``, ``"careful"``, or the one that the teacher, else the pupil, was
+        heuristic: None, one of :data:`rl2grid.engines.HEURISTICS`, or the one that the teacher, else the pupil, was
             trained with; none for agents without training.
         pupil: who acts while the teacher says what it would do (DAgger): the next round of a folder that has labels;
             None: the teacher acts.

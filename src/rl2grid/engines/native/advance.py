@@ -15,6 +15,7 @@ from rl2grid.engines.native.environments import Environments, open_environments
 from rl2grid.engines.native.orders import Orders, order_one_change
 from rl2grid.engines.native.simulation import begin_simulation, copy_environment, finish_simulation
 from rl2grid.engines.native.step import begin_step, dispatch_or_lose, finish_step
+from rl2grid.handles import opener
 from rl2grid.mdp.accumulate import accrue, begin_episode, begin_transition, end_reset
 from rl2grid.mdp.actions import ActionKind
 from rl2grid.mdp.heuristics import (
@@ -34,16 +35,20 @@ from rl2grid.mdp.observations import (
     write_topology_observation,
 )
 from rl2grid.mdp.rewards import default_components, paper_components, released_components
+from rl2grid.mdp.security import Security, is_secure
 from rl2grid.mdp.state import GridState
 from rl2grid.memory import take_next
 
-ALONE, IDLE, RECOVERY, RECONNECT, CAREFUL, CAREFUL_RECONNECT = range(6)
-"""Who plays between two decisions: nobody, or a heuristic (recovery and careful only reconnect on continuous tasks)."""
+open_security = opener(Security)
+"""From the address of a handle to what may be lost, in compiled code."""
+
+ALONE, IDLE, RECOVERY, RECONNECT, CAREFUL, CAREFUL_RECONNECT, SECURE, SECURE_RECONNECT = range(8)
+"""Who plays between two decisions: nobody, or a heuristic (all but idle only reconnect on continuous tasks)."""
 
 DEFAULT, PAPER, RELEASED = range(3)
 """Rewards that are compiled in."""
 
-_NOTHING, _MOVE = int(ActionKind.NOTHING), int(ActionKind.MOVE)
+_NOTHING, _MOVE, _RESTORE = int(ActionKind.NOTHING), int(ActionKind.MOVE), int(ActionKind.RESTORE)
 
 Components = tuple[float, float, float]
 
@@ -52,6 +57,7 @@ Components = tuple[float, float, float]
 def advance(
     address: int,
     simulated: int,
+    security: int,
     rows: NDArray[np.int64],
     counter: NDArray[np.int64],
     begins: bool,
@@ -71,7 +77,9 @@ def advance(
 
     Args:
         address: of the handle to the :class:`~rl2grid.engines.native.environments.Environments`.
-        simulated: address of a handle to one environment, in which the careful heuristic tries things.
+        simulated: address of a handle to one environment, in which careful heuristics try things.
+        security: address of a handle to the :class:`~rl2grid.mdp.security.Security` of the thread, for those that
+            look at it.
         rows: environments, int64 [k].
         counter: int64 [1], how many of ``rows`` were taken so far, by all threads that play them together.
         begins: the first rows of episodes are shown; nobody acts.
@@ -112,7 +120,9 @@ def advance(
                 remember_topology(state, i)
                 _remember_moves(state, orders, i)
         while heuristic != ALONE and not (state.terminated[i] or state.truncated[i]) and is_safe(state, i):
-            kind, target = _heuristic_action(environments, simulated, i, heuristic)
+            kind, target = _heuristic_action(environments, simulated, security, i, heuristic)
+            if kind == _NOTHING and _asks(state, i, heuristic, security):
+                break
             order_one_change(orders, i, kind, target)
             _step(environments, i, reward, weights, gamma)
             if heuristic >= CAREFUL:
@@ -153,24 +163,38 @@ def _order(
 
 
 @jit
-def _heuristic_action(environments: Environments, simulated: int, i: int, heuristic: int) -> tuple[int, int]:
+def _asks(state: GridState, i: int, heuristic: int, security: int) -> bool:
+    """Whether the agent decides in row ``i``, where the grid is safe and the heuristic has nothing to do."""
+    return heuristic >= SECURE and not is_secure(open_security(security), state, i, state, i)
+
+
+@jit
+def _heuristic_action(
+    environments: Environments, simulated: int, security: int, i: int, heuristic: int
+) -> tuple[int, int]:
     if heuristic == RECOVERY:
         return recovery_action(environments.state, i)
     if heuristic == RECONNECT:
         return reconnect_action(environments.state, i)
     if heuristic >= CAREFUL:
-        return _careful_action(environments, simulated, i, heuristic == CAREFUL_RECONNECT)
+        return _careful_action(environments, simulated, security, i, heuristic)
     return _NOTHING, 0
 
 
 @jit
-def _careful_action(environments: Environments, simulated: int, i: int, only_lines: bool) -> tuple[int, int]:
+def _careful_action(
+    environments: Environments, simulated: int, security: int, i: int, heuristic: int
+) -> tuple[int, int]:
     """The first candidate that the forecast allows; else nothing."""
     state = environments.state
+    only_lines = heuristic in (CAREFUL_RECONNECT, SECURE_RECONNECT)
     candidate = careful_candidate(state, i, 0)
     while candidate >= 0 and not (only_lines and candidate >= state.line_status.shape[1]):
         kind, target = candidate_action(state, candidate)
-        if _forecast_allows(environments, open_environments(simulated), i, kind, target):
+        trial = open_environments(simulated)
+        if _forecast_allows(environments, trial, i, kind, target) and (
+            heuristic < SECURE or kind != _RESTORE or is_secure(open_security(security), state, i, trial.state, 0)
+        ):
             return kind, target
         candidate = careful_candidate(state, i, candidate + 1)
     return _NOTHING, 0

@@ -18,6 +18,7 @@ _NUMBERS = types.Array(types.int64, 1, "C")
 SIGNATURE = (
     types.int64,  # address
     types.int64,  # simulated
+    types.int64,  # security
     _NUMBERS,  # rows
     _NUMBERS,  # counter
     types.boolean,  # begins

@@ -73,13 +73,13 @@ class NativeEngine:
         self.grid = grid
         self.dispatch = dispatch
         self._given_network = network
-        self._network = load_network(grid) if network is None else network
+        self.network = load_network(grid) if network is None else network
         self._opponent = opponent
-        self._attacks = opponent and grid.opponent.kind != "none"
+        self.attacks = opponent and grid.opponent.kind != "none"
         self._playing: list[Playing | None] = [None] * n
         # Behind an imagined future: planners come back to it.
         self._true: list[Playing | None] = [None] * n
-        self._use(new_environments(grid, self._network, n, self._attacks))
+        self._use(new_environments(grid, self.network, n, self.attacks))
         self._simulated = self._new_simulated()
         # Of threads that play transitions: a question from outside keeps its answer in the one above.
         self._trials: list[Handle[Environments]] = []
@@ -94,7 +94,7 @@ class NativeEngine:
         series = open_series(self.grid.id, plan.scenario_id)
         outages = planned_outages(self.grid, series, plan)
         draws = None
-        if self._attacks:
+        if self.attacks:
             stream = Stream(plan.seed, plan.number, Purpose.OPPONENT)
             draws = draw_opponent(self.grid, stream, plan.n_steps)
         self.begin(i, series, plan.start, plan.n_steps, outages, draws)
@@ -159,7 +159,7 @@ class NativeEngine:
         n_steps: int = MAX_STEPS,
     ) -> None:
         """Show the first rows of the episodes that were drawn, in ``rows``; threads may show different ones."""
-        begin_episodes(self.address_for(thread), library.address, rows, draws, maintained, self._attacks, n_steps)
+        begin_episodes(self.address_for(thread), library.address, rows, draws, maintained, self.attacks, n_steps)
 
     def take_training(
         self, library: TrainingLibrary, rows: I64, draws: Draws, maintained: bool, n_steps: int = MAX_STEPS
@@ -273,7 +273,7 @@ class NativeEngine:
             return source
         assert isinstance(name, SeriesName)
         gen_v = self.environments.hidden.gen_v[i]
-        return outlook_of(source, name.start, int(state.step[i]), self._network, gen_v)
+        return outlook_of(source, name.start, int(state.step[i]), self.network, gen_v)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> NativeEngine:
         """An engine of its own, whose environments are where these are; grid and series are shared."""
@@ -320,7 +320,7 @@ class NativeEngine:
 
     def _new_simulated(self) -> Handle[Environments]:
         """One environment, which is brought to where another is and played on the forecast."""
-        return Handle(new_environments(self.grid, self._network, 1, opponent=False))
+        return Handle(new_environments(self.grid, self.network, 1, opponent=False))
 
     def _use(self, environments: Environments) -> None:
         self.environments = environments
@@ -328,7 +328,7 @@ class NativeEngine:
         self._handles = [Handle(environments)]
         self._layout = RowLayout(environments)
         fingerprint = grid_fingerprint(self.grid)
-        self.home = Home("native", self.grid.id, fingerprint, self.dispatch, self._attacks, self._layout.hash)
+        self.home = Home("native", self.grid.id, fingerprint, self.dispatch, self.attacks, self._layout.hash)
 
     def _make_room(self, outages: int) -> None:
         """Grow the arrays to hold that many planned outages per environment."""

@@ -24,6 +24,8 @@ from rl2grid.engines.native.advance import (
     RECONNECT,
     RECOVERY,
     RELEASED,
+    SECURE,
+    SECURE_RECONNECT,
     advance,
     write_observations,
 )
@@ -35,6 +37,7 @@ from rl2grid.engines.native.threads import Threads
 from rl2grid.engines.native.training_library import training_library
 from rl2grid.engines.transition import Transitions
 from rl2grid.grids import Grid
+from rl2grid.handles import Handle
 from rl2grid.mdp.actions import (
     DO_NOTHING,
     ActionKind,
@@ -48,7 +51,9 @@ from rl2grid.mdp.actions import (
 )
 from rl2grid.mdp.features import changes_topology, injects
 from rl2grid.mdp.rewards import default_components, paper_components, released_components
+from rl2grid.mdp.security import Security
 from rl2grid.scenarios.episodes import MAX_STEPS, EpisodePlan
+from rl2grid.structures import with_own_workspace
 
 _COMPILED_IN: dict[Callable[..., Any], int] = {
     default_components: DEFAULT,
@@ -62,6 +67,8 @@ _CODES = {
     ("recovery", False): RECONNECT,
     ("careful", True): CAREFUL,
     ("careful", False): CAREFUL_RECONNECT,
+    ("secure", True): SECURE,
+    ("secure", False): SECURE_RECONNECT,
 }
 """What a heuristic is where agents have topology actions, and where not."""
 _ROWS_PER_THREAD = 8
@@ -203,6 +210,7 @@ class NativeTransitions(Transitions):
         self._rows = np.arange(n)
         self._no_effects = np.full(n, "", object)
         self._nothing = commands_of(self.engine.grid, [DO_NOTHING] * n)
+        self._securities: list[Handle[Security]] = []
         if self.is_compiled:
             compile_ahead()
 
@@ -244,7 +252,7 @@ class NativeTransitions(Transitions):
         Raises:
             UsageError: the heuristic looks at forecasts, and a series has none.
         """
-        if self.heuristic == "careful":
+        if self.looks_ahead:
             for i in rows.tolist():
                 self.engine.check_horizon(i, 1)
 
@@ -323,11 +331,18 @@ class NativeTransitions(Transitions):
             self._addresses(thread)
         self._threads.map(play, range(parts), slices)
 
-    def _addresses(self, thread: int) -> tuple[int, int]:
-        """The environments, and where the careful heuristic may try things, for one thread."""
+    def _addresses(self, thread: int) -> tuple[int, int, int]:
+        """The environments, where heuristics may try things, and what may be lost, for one thread."""
         address = self.engine.address_for(thread)
-        # No other heuristic looks there.
-        return address, self.engine.trial_address_for(thread) if self.heuristic == "careful" else address
+        # Where a heuristic does not look, any address will do.
+        trial = self.engine.trial_address_for(thread) if self.looks_ahead else address
+        return address, trial, self._security_address_for(thread) if self.heuristic == "secure" else address
+
+    def _security_address_for(self, thread: int) -> int:
+        while len(self._securities) <= thread:
+            own = with_own_workspace(self.security)
+            self._securities.append(Handle(own))
+        return self._securities[thread].address
 
     def _advance_some(self, thread: int, rows: I64, counter: I64, commands: Commands, begins: bool) -> None:
         weights = self.reward.weights

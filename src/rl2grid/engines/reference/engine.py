@@ -20,6 +20,7 @@ from rl2grid.mdp.actions import ActionKind, Change, StepAction, check_changes, d
 from rl2grid.mdp.opponents import draw_opponent, load_draws, new_opponent_state
 from rl2grid.mdp.state import OBSERVED, OBSERVED_STORAGE, GridState, new_state
 from rl2grid.mdp.termination import GameOver, game_over_reason
+from rl2grid.powerflow.model import load_network
 from rl2grid.scenarios.episodes import EpisodePlan, maintenance_matrix
 from rl2grid.scenarios.library import list_scenarios, load_scenario
 from rl2grid.streams import Purpose, Stream
@@ -52,12 +53,12 @@ class ReferenceEngine:
         self.state = new_state(grid, n)
         self._simulated = new_state(grid, 1)
         self._dispatch = dispatch
-        self._attacks = opponent
+        self.network = load_network(grid)
+        self.attacks = opponent and grid.opponent.kind != "none"
         self._plans: list[EpisodePlan | None] = [None] * n
         self._actions: list[list[StepAction]] = [[] for _ in range(n)]
-        attacked = opponent and grid.opponent.kind != "none"
-        self._home = Home("reference", grid.id, grid_fingerprint(grid), dispatch, attacked, _LAYOUT)
-        self._opponent = new_opponent_state(grid, n) if opponent and grid.opponent.kind != "none" else None
+        self._home = Home("reference", grid.id, grid_fingerprint(grid), dispatch, self.attacks, _LAYOUT)
+        self._opponent = new_opponent_state(grid, n) if self.attacks else None
         self._environments = self._make_environments(n)
         self._do_nothing = [environment.action_space() for environment in self._environments]
         self._observations: list[Any] = [None] * n
@@ -185,7 +186,7 @@ class ReferenceEngine:
 
     def __reduce__(self) -> tuple[Any, ...]:
         worlds = [None if plan is None else self.save(i) for i, plan in enumerate(self._plans)]
-        return _rebuild, (self.grid, self._dispatch, self._attacks, worlds)
+        return _rebuild, (self.grid, self._dispatch, self.attacks, worlds)
 
     def _saved(self) -> list[np.ndarray[Any, Any]]:
         """The arrays of the state that have an axis of environments."""
