@@ -169,13 +169,13 @@ def naive_states(network: GraphNetwork, spec: Spec, observation: Tensor) -> NDAr
     grid, messages = spec.grid, network.messages
     assert grid is not None
     elements = network.features(observation.unsqueeze(0))
-    second, in_service = elements.second[:, 0].numpy() > 0, elements.in_service[:, 0].numpy() > 0
+    second, in_service = elements.second[:, 0].numpy() > 0, elements.in_service[:, 0, 0].numpy() > 0
 
     def layer(of: Any, values: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.asarray(of.weight.detach().double() @ torch.from_numpy(values) + of.bias.detach().double())
 
     def read(of: Any, values: Tensor) -> list[NDArray[np.float64]]:
-        return [layer(of, values[:, k, 0].double().numpy()) for k in range(values.shape[1])]
+        return [layer(of, each) for each in values[:, :, 0].double().numpy()]
 
     subs = np.concatenate((grid.line_or_to_subid, grid.line_ex_to_subid, grid.gen_to_subid, grid.load_to_subid))
     subs = np.concatenate((subs, grid.storage_to_subid))
@@ -211,7 +211,47 @@ def test_lines_hear_what_the_equations_say(task: str, split: float):
         states = network.messages(network.features(shown)).lines
     for row in range(len(shown)):
         expected = naive_states(network, spec, shown[row])
-        np.testing.assert_allclose(states[:, :, row].T.numpy(), expected, rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(states[:, :, row].numpy(), expected, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("task", "output"),
+    [
+        ("bus14-T0", Output(per_state=1, per_action=2)),
+        ("bus14-T0", PER_ACTION),
+        ("bus14-H0", VALUE_OF_ACTION),
+        ("bus118-MOB-v0-R", VALUE_OF_ACTION),
+    ],
+)
+def test_derivatives_written_by_hand_are_those_of_the_numbers(task: str, output: Output):
+    spec = spec_of_task(task)
+    network = factory(spec, "gnn").make(output, (16, 16)).double()
+    shown = observations(spec, 2, split=0.2).double()
+    if output.reads_action:
+        generator = torch.Generator().manual_seed(0)
+        shown = torch.cat([shown, torch.rand(2, spec.action_size, generator=generator).double()], dim=1)
+    shown.requires_grad_()
+    mixed = torch.randn(output.width(spec), generator=torch.Generator().manual_seed(0)).double()
+    (network(shown) @ mixed).sum().backward()
+    # Along random directions of all weights, with the action that is read.
+    varied = [each for each in network.parameters() if each.grad is not None]
+    generator = torch.Generator().manual_seed(1)
+    for _ in range(5):
+        directions = [torch.randn(each.shape, generator=generator).double() for each in varied]
+        of_shown = torch.zeros_like(shown)
+        of_shown[:, spec.observation_size :] = 1.0
+        expected = sum(float((each.grad * by).sum()) for each, by in zip(varied, directions, strict=True))
+        assert shown.grad is not None
+        expected += float((shown.grad * of_shown).sum())
+        numbers = []
+        for step in (1e-6, -1e-6):
+            with torch.no_grad():
+                for each, by in zip(varied, directions, strict=True):
+                    each.add_(by, alpha=step)
+                numbers.append(float((network(shown + step * of_shown) @ mixed).sum()))
+                for each, by in zip(varied, directions, strict=True):
+                    each.sub_(by, alpha=step)
+        assert (numbers[0] - numbers[1]) / 2e-6 == pytest.approx(expected, rel=1e-5)
 
 
 def test_what_is_far_away_is_not_heard_in_two_rounds():
@@ -229,7 +269,7 @@ def test_what_is_far_away_is_not_heard_in_two_rounds():
     other = shown.clone()
     other[0, spec.feature("rho").begin] += 0.5
     with torch.no_grad():
-        states = [network.messages(network.features(each)).lines[:, :, 0] for each in (shown, other)]
+        states = [network.messages(network.features(each)).lines[:, :, 0].T for each in (shown, other)]
     differ = (states[0] != states[1]).any(dim=0).nonzero().flatten().tolist()
     assert 0 in differ
     assert len(differ) > 1

@@ -18,13 +18,14 @@ opposite of moving there. The dimensions of a continuous action are scored in th
 generators and storage units. The weights are as many for 66,978 actions as for 50, and grow with a grid only by what is
 learned of its substations and lines.
 
-All arrays are [width, element, batch]: what leads along lines then copies whole rows, and layers are one product.
+All arrays are [element, width, batch]: what leads along lines then moves whole rows. The steps that do have derivatives
+written by hand, in :mod:`rl2grid.algorithms.networks.graph_functions`.
 """
 
 from __future__ import annotations
 
 import itertools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -37,7 +38,19 @@ from rl2grid.algorithms.networks.action_table import (
     Places,
     action_table,
     first_table,
-    with_first,
+)
+from rl2grid.algorithms.networks.graph_functions import (
+    Busbars,
+    Incidence,
+    Injected,
+    Layers,
+    OnBusbars,
+    Pooled,
+    Read,
+    Rounds,
+    RowSums,
+    Scores,
+    applied,
 )
 from rl2grid.arrays import I32
 from rl2grid.envs.spec import Spec
@@ -53,18 +66,18 @@ _SHARE, _LEAST_WIDTH = 16, 8
 
 
 class _Elements(NamedTuple):
-    """What is known of the grid's elements, each [feature, element, batch], and where they are."""
+    """What is known of the grid's elements, each [element, feature, batch], and where they are."""
 
     line: Tensor
     gen: Tensor
     load: Tensor
     storage: Tensor
     cooldown: Tensor
-    """[1, substation, batch]"""
+    """[substation, 1, batch]"""
     second: Tensor
     """[element, batch] 1 where on busbar 2; in the order of :mod:`rl2grid.algorithms.networks.action_table`"""
     in_service: Tensor
-    """[line, batch]"""
+    """[line, 1, batch]"""
     time: Tensor
     """[1, batch]"""
 
@@ -78,6 +91,7 @@ class Features(nn.Module):
         assert spec.task is not None
         grid = self.grid = spec.grid
         self.slices = {feature.name: slice(feature.begin, feature.end) for feature in spec.features}
+        self.lengths = [feature.end - feature.begin for feature in spec.features]
         self.observed = spec.observation_size
         self.is_physical = spec.normalize == "physical"
         self.has_topology = "topo_vect" in self.slices
@@ -124,17 +138,17 @@ class Features(nn.Module):
         if not self.is_physical:
             observations = (observations - self.shift) / self.scale
         rows = observations.T.contiguous()
-        part = {name: rows[where] for name, where in self.slices.items()}
+        part = dict(zip(self.slices, torch.split(rows, self.lengths), strict=True))
         second, in_service = self._topology(part)
         cooldown = part.get("time_before_cooldown_sub", rows.new_zeros(self.grid.n_sub, rows.shape[1]))
         return _Elements(
             line=self._lines(part, in_service, second),
             gen=self._gens(part, inputs),
-            load=torch.stack([part["load_p"], part["load_p"] * self.load_size, part["load_theta"]]),
+            load=torch.stack([part["load_p"], part["load_p"] * self.load_size, part["load_theta"]], dim=1),
             storage=self._storages(part, inputs) if self.grid.n_storage else rows.new_zeros(0, 0, 0),
-            cooldown=cooldown.unsqueeze(0),
+            cooldown=cooldown.unsqueeze(1),
             second=second,
-            in_service=in_service,
+            in_service=in_service.unsqueeze(1),
             time=part["t"],
         )
 
@@ -144,13 +158,13 @@ class Features(nn.Module):
         if not self.has_topology:
             return rho.new_zeros(len(self.order), rho.shape[1]), (rho > 0).to(rho.dtype)
         topology = part["topo_vect"].index_select(0, self.order)
-        both = (topology[:n_line] > -0.5) & (topology[n_line : 2 * n_line] > -0.5)
-        return (topology > 0.5).to(rho.dtype), both.to(rho.dtype)
+        in_service = torch.minimum(topology[:n_line], topology[n_line : 2 * n_line]).gt_(-0.5)
+        return topology.clone().gt_(0.5), in_service
 
     def _lines(self, part: dict[str, Tensor], in_service: Tensor, second: Tensor) -> Tensor:
         rho, n_line = part["rho"], self.grid.n_line
         steps = part["time_next_maintenance"] * self.scale[self.slices["time_next_maintenance"]].unsqueeze(-1)
-        announced = torch.where(steps >= 0, (-steps.clamp(min=0.0) / _URGENT_STEPS).exp(), 0.0)
+        announced = (steps.clamp(min=0.0) / -_URGENT_STEPS).exp() * steps.clone().ge_(0.0)
         columns = [
             rho,
             (rho - _STRESSED).clamp(min=0.0) * 5.0,
@@ -162,19 +176,19 @@ class Features(nn.Module):
             second[:n_line],
             second[n_line : 2 * n_line],
         ]
-        return torch.stack(columns)
+        return torch.stack(columns, dim=1)
 
     def _gens(self, part: dict[str, Tensor], inputs: Tensor) -> Tensor:
         gen_p = part["gen_p"]
         columns = [gen_p, gen_p * self.gen_size, part["gen_theta"], self.renewable.expand_as(gen_p)]
         columns += [part[name] for name in self.dispatch]
         columns += [self._entries(inputs, kind, gen_p) for kind in (0, 1)] if self.reads_action else []
-        return torch.stack(columns)
+        return torch.stack(columns, dim=1)
 
     def _storages(self, part: dict[str, Tensor], inputs: Tensor) -> Tensor:
         columns = [part[name] for name in self.of_storage]
         columns += [self._entries(inputs, 2, columns[0])] if self.reads_action else []
-        return torch.stack(columns)
+        return torch.stack(columns, dim=1)
 
     def _entries(self, inputs: Tensor, kind: int, like: Tensor) -> Tensor:
         """What the action that is read asks of every generator or storage unit [unit, batch]."""
@@ -188,95 +202,72 @@ class Messages(nn.Module):
     def __init__(self, request: Request, features: Features, width: int, rounds: int) -> None:
         super().__init__()
         grid, sizes = features.grid, features.sizes()
-        self.n_sub, self.n_line = grid.n_sub, grid.n_line
         ends = torch.cat([ids(grid.line_or_to_subid), ids(grid.line_ex_to_subid)])
         units = torch.cat([ids(each) for each in (grid.gen_to_subid, grid.load_to_subid, grid.storage_to_subid)])
         degree = torch.bincount(ends, minlength=grid.n_sub).clamp(min=1).to(torch.float32)
-        for name, tensor in (("ends", ends), ("units", units), ("per_line", degree.rsqrt().repeat(2).unsqueeze(-1))):
-            self.register_buffer(name, tensor, persistent=False)
+        self.register_buffer("subs", torch.cat([ends, units]), persistent=False)
+        self.of_ends = Incidence(ends, torch.arange(grid.n_line).repeat(2), grid.n_sub, degree.rsqrt())
+        self.of_units = Incidence(units, torch.arange(len(units)), grid.n_sub, torch.ones(grid.n_sub))
         self.read_line, self.read_gen, self.read_load = (_Layer(request, size, width) for size in sizes[:3])
         self.read_storage = _Layer(request, sizes[3], width) if grid.n_storage else None
         self.of_line = nn.Parameter(first_table(grid.n_line, width, request))
         self.to_self = nn.ModuleList(_Layer(request, width, width) for _ in range(rounds))
         self.to_others = nn.ModuleList(_Layer(request, width, width) for _ in range(rounds))
 
-    ends: Tensor
-    units: Tensor
-    per_line: Tensor
+    subs: Tensor
 
     def forward(self, elements: _Elements) -> _States:
         """The states of everything."""
-        parts = [self.read_gen(elements.gen), self.read_load(elements.load)]
+        kinds = [(self.read_line, elements.line), (self.read_gen, elements.gen), (self.read_load, elements.load)]
         if self.read_storage is not None:
-            parts.append(self.read_storage(elements.storage))
-        units = torch.cat(parts, dim=1)
-        moved = elements.second.any(dim=1)
-        n_busbars = self.n_sub * (1 + int(moved.any()))
-        ends = _OnBusbars(self.ends, elements.second[: 2 * self.n_line], self.n_sub)
-        injected = _OnBusbars(self.units, elements.second[2 * self.n_line :], self.n_sub).added(
-            units, units.new_zeros(len(units), n_busbars, units.shape[2])
+            kinds.append((self.read_storage, elements.storage))
+        read, units = applied(
+            Read, self.of_line, *itertools.chain(*((features, layer.weight, layer.bias) for layer, features in kinds))
         )
-        read = self.read_line(elements.line).add_(self.of_line.T.unsqueeze(-1))
-        lines = read.relu()
-        for to_self, to_others in zip(self.to_self, self.to_others, strict=True):
-            busbars = ends.added(lines * elements.in_service, injected.clone())
-            at_ends = ends.of(busbars.mul_(self.per_line[:n_busbars]))
-            heard = (at_ends[:, : self.n_line] + at_ends[:, self.n_line :]).mul_(elements.in_service)
-            lines = to_self(lines).add_(to_others(heard)).add_(read).relu_()
-        return _States(lines, units, injected, ends, elements)
+        of_ends, of_units = self._on_busbars(elements.second)
+        injected = applied(Injected, units, of_units)
+        rounds = list(itertools.chain(*zip(self.to_self, self.to_others, strict=True)))
+        lines = applied(
+            Rounds,
+            read,
+            *injected,
+            elements.in_service,
+            of_ends,
+            *(layer.weight for layer in rounds),
+            *(layer.bias for layer in rounds),
+        )
+        return _States(lines, units, injected, of_ends, elements)
+
+    def _on_busbars(self, second: Tensor) -> tuple[OnBusbars, OnBusbars]:
+        """Where lines' ends and where units are."""
+        moved = second.sum(dim=1).nonzero().squeeze(-1)
+        divided, beside = torch.unique(self.subs.index_select(0, moved), return_inverse=True)
+        n_ends, shown = len(self.of_ends.subs), second.index_select(0, moved).unsqueeze(1)
+        n = int((moved < n_ends).sum())
+        return (
+            OnBusbars(self.of_ends, moved[:n], beside[:n], shown[:n], divided),
+            OnBusbars(self.of_units, moved[n:] - n_ends, beside[n:], shown[n:], divided),
+        )
 
     def busbars(self, states: _States) -> Tensor:
-        """The states of busbars, [width, 2 n_sub, batch]."""
-        lines, injected = states.lines, states.injected
-        if injected.shape[1] == self.n_sub:
-            injected = torch.cat([injected, torch.zeros_like(injected)], dim=1)
-        else:
-            injected = injected.clone()
-        return states.ends.added(lines * states.elements.in_service, injected).mul_(self.per_line)
+        """Busbars 1 and 2 of every substation, and its cooldown: [substation, 2 width + 1, batch]."""
+        elements = states.elements
+        busbars: Tensor = applied(
+            Busbars, states.lines, *states.injected, elements.in_service, elements.cooldown, states.ends
+        )
+        return busbars
 
 
 class _States(NamedTuple):
-    """The states after all rounds, each [width, element, batch]."""
+    """The states after all rounds, each [element, width, batch]."""
 
     lines: Tensor
     units: Tensor
     """generators, loads and storage units"""
-    injected: Tensor
-    """what the units at each busbar hold together; of busbars 1 alone where the whole batch has no others"""
-    ends: _OnBusbars
+    injected: tuple[Tensor, Tensor]
+    """what the units at each busbar hold together"""
+    ends: OnBusbars
     elements: _Elements
-
-
-class _OnBusbars:
-    """Which busbars elements are on, in a batch: busbar 1 of their substation, but for a few."""
-
-    def __init__(self, subs: Tensor, second: Tensor, n_sub: int) -> None:
-        self.subs, self.n_sub = subs, n_sub
-        self.moved = second.any(dim=1).nonzero().squeeze(-1)
-        self.second = second.index_select(0, self.moved)
-        self.moved_subs = subs.index_select(0, self.moved)
-
-    def of(self, busbars: Tensor) -> Tensor:
-        """What the busbar of each element holds, [width, element, batch]."""
-        held = busbars.index_select(1, self.subs)
-        if not len(self.moved):
-            return held
-        here = busbars.index_select(1, self.moved_subs)
-        there = busbars.index_select(1, self.moved_subs + self.n_sub)
-        return held.index_add_(1, self.moved, (there - here).mul_(self.second))
-
-    def added(self, values: Tensor, sums: Tensor) -> Tensor:
-        """Add to ``sums`` [width, busbar, batch] what the elements at each busbar hold.
-
-        ``values`` are of elements, or of half as many, lines, each of which counts at both of its ends.
-        """
-        n = values.shape[1]
-        for first in range(0, len(self.subs), n):
-            sums.index_add_(1, self.subs[first : first + n], values)
-        if not len(self.moved):
-            return sums
-        moved = values.index_select(1, self.moved % n).mul_(self.second)
-        return sums.index_add_(1, self.moved_subs, moved, alpha=-1.0).index_add_(1, self.moved_subs + self.n_sub, moved)
 
 
 class GraphNetwork(nn.Module):
@@ -298,17 +289,16 @@ class GraphNetwork(nn.Module):
         """Numbers [batch, inputs] -> [batch, width]."""
         elements = self.features(inputs)
         states = self.messages(elements)
-        lines = states.lines
-        hidden = self.state(torch.cat([lines.mean(dim=1), lines.amax(dim=1), states.units.mean(dim=1), elements.time]))
+        hidden = self.state(torch.cat([applied(Pooled, states.lines, states.units), elements.time]))
         if self.chosen is not None:
             first = self.features.observed
             entries = inputs[:, first : first + self.features.n_topology]
-            hidden = hidden + self.chosen(entries, self.messages.busbars(states), lines)
+            hidden = hidden + self.chosen(entries, self.messages.busbars(states), states.lines)
         context = hidden.relu()
         numbers = [] if self.of_state is None else [self.of_state(context).T]
         if self.scores is not None:
             numbers.append(self.scores(context, self.messages.busbars(states), states))
-        return torch.cat(numbers, dim=-1)
+        return numbers[0] if len(numbers) == 1 else torch.cat(numbers, dim=-1)
 
 
 class _Scores(nn.Module):
@@ -318,7 +308,7 @@ class _Scores(nn.Module):
         super().__init__()
         assert request.spec.grid is not None
         grid, table = request.spec.grid, action_table(request.spec)
-        self.n_sub, self.n_gen, self.loads = grid.n_sub, grid.n_gen, grid.n_gen + grid.n_load
+        self.n_sub = grid.n_sub
         counts = (grid.n_line, grid.n_line, grid.n_gen, grid.n_load, grid.n_storage)
         self._keep(table, Places.of(grid), counts)
 
@@ -333,81 +323,103 @@ class _Scores(nn.Module):
             self.of_place = nn.Parameter(first_table(grid.n_sub + grid.n_line, width, request))
         # Of every kind of element that the grid has, whatever this task's actions move.
         self.moves = nn.ModuleDict({str(k): layer(width, width) for k, n in enumerate(counts) if topology and n})
-        if len(self.at_units):
+        if "of_unit" in self.layers:
             self.of_unit = layer(width, width)
         self.of_action = layer(width, request.output.per_action, last=True)
         self.do_nothing = nn.Parameter(torch.tensor(request.first_action or 0.0))
 
     def _keep(self, table: ActionTable, places: Places, counts: tuple[int, ...]) -> None:
-        """What of the table is needed: of places and elements only those that some action is about."""
+        """What of the table is needed: of places, kinds and elements only those that some action is about."""
         kinds, where, elements, offsets = table.tensors()
+        n_gen, n_load = counts[2:4]
         at, place_of_action = torch.unique(where, return_inverse=True)
         moved, moved_of_action = torch.unique(elements, return_inverse=True)
-        bounds = (0, places.lines, places.gens, places.nowhere, len(places))
-        for name, (first, after) in zip(("subs", "lines", "units", "nowhere"), itertools.pairwise(bounds), strict=True):
-            self.register_buffer(f"at_{name}", at[(at >= first) & (at < after)] - first, persistent=False)
-        begins = torch.tensor([0, *counts]).cumsum(0).tolist()
-        for k, (first, after) in enumerate(itertools.pairwise(begins)):
-            self.register_buffer(f"part_{k}", moved[(moved >= first) & (moved < after)] - first, persistent=False)
-        for name, tensor in (
-            ("kinds", kinds.T.contiguous()),
-            ("where", place_of_action),
-            ("elements", moved_of_action),
-            ("offsets", offsets),
-            ("moved", moved),
-        ):
+        some_kinds, kind_of_action = torch.unique(kinds, dim=0, return_inverse=True)
+        n_kinds, n_places, n_ends = len(some_kinds), int((at < places.nowhere).sum()), 2 * counts[0]
+        subs, lines = at[at < places.lines], at[(at >= places.lines) & (at < places.gens)] - places.lines
+        units = at[(at >= places.gens) & (at < places.nowhere)] - places.gens
+        ends, others = moved[moved < n_ends], moved[moved >= n_ends]
+        # Rows of lines, then of units: those that actions change, and those that they move.
+        elements_of_rows = torch.cat([lines.new_full(lines.shape, -1), ends, units.new_full(units.shape, -1), others])
+        of_elements = torch.bucketize(elements_of_rows, torch.tensor(counts).cumsum(0), right=True)
+        groups = of_elements.masked_fill(elements_of_rows < 0, len(counts))
+        groups[len(lines) + len(ends) :][: len(units)] = len(counts) + 1
+        used, group = torch.unique(groups, return_inverse=True)
+        self.layers = [(*(f"moves.{k}" for k in range(len(counts))), "of_line", "of_unit")[k] for k in used.tolist()]
+        """Of the groups of rows."""
+        # What an action adds up: its kind, its place, unless that is nowhere, and the elements that it moves.
+        somewhere, every = where < places.nowhere, torch.arange(len(table))
+        lengths = torch.diff(offsets, append=torch.tensor([len(elements)]))
+        actions = torch.cat([every, every[somewhere], every.repeat_interleave(lengths)])
+        n_lines = len(subs) + len(lines)
+        place_of_action = place_of_action + torch.where(place_of_action >= n_lines, len(ends), 0)
+        moved_of_action = moved_of_action + torch.where(moved_of_action >= len(ends), n_places, n_lines)
+        rows = torch.cat([kind_of_action, place_of_action[somewhere] + n_kinds, moved_of_action + n_kinds])
+        self.sums = RowSums(actions, rows, len(table))
+        self.back = RowSums(rows, actions, n_kinds + len(subs) + len(group))
+        kept = {
+            "kinds": some_kinds,
+            "at_subs": subs,
+            "at_lines": lines,
+            "of_lines": torch.cat([lines, ends % counts[0]]),
+            "of_units": torch.cat([torch.where(units < n_gen, units, units + n_load), others - n_ends]),
+            "group": group,
+            "elements": elements_of_rows.clamp(min=0),
+            "is_moved": (elements_of_rows >= 0).to(torch.float32).unsqueeze(-1),
+        }
+        for name, tensor in kept.items():
             self.register_buffer(name, tensor, persistent=False)
 
+    kinds: Tensor
     at_subs: Tensor
     at_lines: Tensor
-    at_units: Tensor
-    at_nowhere: Tensor
-    kinds: Tensor
-    where: Tensor
+    of_lines: Tensor
+    of_units: Tensor
+    group: Tensor
     elements: Tensor
-    offsets: Tensor
-    moved: Tensor
+    is_moved: Tensor
 
     def forward(self, context: Tensor, busbars: Tensor, states: _States) -> Tensor:
         """Of states [.., batch], [batch, number times action]."""
-        hidden = self._places(busbars, states).index_select(1, self.where)
-        hidden.add_(self.of_context(context).unsqueeze(1)).add_(self.of_kind(self.kinds).unsqueeze(-1))
-        if len(self.elements):
-            hidden.add_(self._moved(states.lines, states.units, states.elements.second))
-        scores: Tensor = self.of_action(hidden.relu_()).flatten(0, 1).T
-        return with_first(scores, self.do_nothing)
-
-    def _places(self, busbars: Tensor, states: _States) -> Tensor:
-        """States of what actions change, [width, place, batch]."""
-        lines, units = states.lines, states.units
-        width, _, batch = lines.shape
-        parts = [lines.new_zeros(width, len(self.at_nowhere), batch)]
-        if len(self.at_units):
-            controlled = torch.cat([units[:, : self.n_gen], units[:, self.loads :]], dim=1)
-            parts.insert(0, self.of_unit(controlled.index_select(1, self.at_units)))
-        if len(self.at_lines):
-            learned = self.of_place.index_select(0, self.at_lines + self.n_sub).T.unsqueeze(-1)
-            parts.insert(0, self.of_line(lines.index_select(1, self.at_lines)) + learned)
+        kinds = nn.functional.linear(self.kinds, self.of_kind.weight, self.of_kind.bias)
+        rows = [kinds.unsqueeze(-1) + self.of_context(context)]
         if len(self.at_subs):
-            both = [busbars.index_select(1, self.at_subs + first) for first in (0, self.n_sub)]
-            learned = self.of_place.index_select(0, self.at_subs).T.unsqueeze(-1)
-            cooldown = self.of_cooldown(states.elements.cooldown.index_select(1, self.at_subs))
-            parts.insert(0, self.of_sub(torch.cat(both)).add_(learned).add_(cooldown))
-        return torch.cat(parts, dim=1)
+            rows.append(self._subs(busbars))
+        if len(self.group):
+            rows.append(self._others(states))
+        last = self.of_action
+        scores = applied(Scores, torch.cat(rows), last.weight, last.bias, self.do_nothing, self.sums, self.back)
+        numbers: Tensor = scores.transpose(0, 1).flatten(0, 1).T
+        return numbers
 
-    def _moved(self, lines: Tensor, units: Tensor, second: Tensor) -> Tensor:
-        """What the elements that an action moves add to it, [width, action, batch]."""
-        states = (lines, lines, units[:, : self.n_gen], units[:, self.n_gen : self.loads], units[:, self.loads :])
-        moves = [
-            self.moves[str(k)](state.index_select(1, chosen))
-            for k, state in enumerate(states)
-            if len(chosen := self.get_buffer(f"part_{k}"))
-        ]
-        signed = torch.cat(moves, dim=1) * (1.0 - 2.0 * second.index_select(0, self.moved))
-        width, n, batch = signed.shape
-        rows = signed.transpose(0, 1).reshape(n, width * batch)
-        summed = nn.functional.embedding_bag(self.elements, rows, self.offsets, mode="sum")
-        return summed.view(-1, width, batch).transpose(0, 1)
+    def _subs(self, busbars: Tensor) -> Tensor:
+        """What substations are worth that actions change, [substation, width, batch]."""
+        weight = torch.cat([self.of_sub.weight, self.of_cooldown.weight], dim=1)
+        constant = self.of_place.index_select(0, self.at_subs) + (self.of_sub.bias + self.of_cooldown.bias)
+        at = busbars.index_select(0, self.at_subs)
+        return torch.baddbmm(constant.unsqueeze(-1), weight.expand(len(at), -1, -1), at)
+
+    def _others(self, states: _States) -> Tensor:
+        """What lines and units are worth that actions change, and elements that they move: [row, width, batch]."""
+        layers: Any = [self.get_submodule(name) for name in self.layers]
+        weight = torch.stack([layer.weight for layer in layers])
+        learned = weight.new_zeros(0, weight.shape[1])
+        if len(self.at_lines):
+            learned = self.of_place.index_select(0, self.at_lines + self.n_sub)
+        second = states.elements.second.index_select(0, self.elements)
+        rows: Tensor = applied(
+            Layers,
+            states.lines,
+            states.units,
+            weight,
+            torch.stack([layer.bias for layer in layers]),
+            learned,
+            (1.0 - 2.0 * self.is_moved * second).unsqueeze(1),
+            self.of_lines,
+            self.of_units,
+            self.group,
+        )
+        return rows
 
 
 class _Chosen(nn.Module):
@@ -417,7 +429,6 @@ class _Chosen(nn.Module):
         super().__init__()
         assert request.spec.grid is not None
         kinds, where, *_ = action_table(request.spec).tensors()
-        self.n_sub = request.spec.grid.n_sub
         nowhere = Places.of(request.spec.grid).gens
         self.register_buffer("kinds", kinds[:n_topology].T.contiguous(), persistent=False)
         self.register_buffer("where", where[:n_topology].clamp(max=nowhere), persistent=False)
@@ -428,15 +439,15 @@ class _Chosen(nn.Module):
 
     def forward(self, entries: Tensor, busbars: Tensor, lines: Tensor) -> Tensor:
         """Of entries [batch, topology action], [4 width, batch]."""
-        nowhere = lines.new_zeros(lines.shape[0], 1, lines.shape[2])
-        places = torch.cat([busbars[:, : self.n_sub] + busbars[:, self.n_sub :], lines, nowhere], dim=1)
-        weighted = (places.index_select(1, self.where) * entries.T).sum(dim=1)
+        nowhere, width = torch.zeros_like(lines[:1]), lines.shape[1]
+        places = torch.cat([busbars[:, :width] + busbars[:, width:-1], lines, nowhere])
+        weighted = (places.index_select(0, self.where) * entries.T.unsqueeze(1)).sum(dim=0)
         chosen: Tensor = self.layer(torch.cat([self.kinds @ entries.T, weighted]))
         return chosen
 
 
 class _Layer(nn.Module):
-    """A layer over the first axis of [inputs, ...]."""
+    """A layer over the first axis of [inputs, batch]."""
 
     def __init__(self, request: Request, inputs: int, outputs: int, *, last: bool = False) -> None:
         super().__init__()
@@ -444,10 +455,8 @@ class _Layer(nn.Module):
         self.weight, self.bias = layer.weight, layer.bias
 
     def forward(self, inputs: Tensor) -> Tensor:
-        """[inputs, ...] -> [outputs, ...], a new array."""
-        # Not addmm, which copies the bias to where the product goes first.
-        outputs = torch.mm(self.weight, inputs.flatten(1)).add_(self.bias.unsqueeze(1))
-        return outputs.view(-1, *inputs.shape[1:])
+        """[inputs, batch] -> [outputs, batch]."""
+        return torch.addmm(self.bias.unsqueeze(-1), self.weight, inputs)
 
 
 def _controls(spec: Spec) -> tuple[tuple[Tensor, Tensor], ...]:
