@@ -1,9 +1,10 @@
 """What networks cost: weights, and the time of a pass beside an ``mlp`` of the same layers in the same run.
 
 ``python benchmarks/networks.py [TASK ...] [--batch N] [--repeats N] [--decisions N]`` measures, for each network of the
-package, one forward and backward pass of a policy and of a critic on one thread (the least of the repetitions, networks
-taking turns), and decisions a second of PPO through ``gymnasium.make_vec``, months and resets included. It writes
-``benchmarks/results/networks.json``. Observations are random; in them one element in a thousand is on busbar 2.
+package, the processor time of one forward and backward pass of a policy and of a critic on one thread (the least of the
+repetitions, networks taking turns), and decisions a second of PPO through ``gymnasium.make_vec``, months and resets
+included. It writes ``benchmarks/results/networks.json``. Observations are random; in them one element in a thousand is
+on busbar 2.
 """
 
 from __future__ import annotations
@@ -49,10 +50,10 @@ def made(spec: Spec, name: str, output: Output) -> nn.Module:
 
 
 def seconds(module: nn.Module, inputs: Tensor) -> float:
-    """Of one forward and backward pass."""
-    began = time.perf_counter()
+    """Processor time of one forward and backward pass, which other processes on the machine do not count into."""
+    began = time.process_time()
     module(inputs).square().mean().backward()
-    return time.perf_counter() - began
+    return time.process_time() - began
 
 
 def passes(spec: Spec, batch: int, repeats: int) -> dict[str, dict[str, float]]:
