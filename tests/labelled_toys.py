@@ -27,7 +27,7 @@ class NothingToPlay(gymnasium.vector.VectorEnv[Any, Any, Any]):
 
     def __init__(self, task: Task | str, **keywords: Any) -> None:
         self.task, self.options = find_task(task), TaskOptions(**keywords)
-        size = observation_size(self.task.grid, self.task.kind)
+        size = observation_size(self.task.grid, self.task.kind, self.options.operator_features)
         self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
         self.single_action_space: Any = gymnasium.spaces.Discrete(self.task.n_actions)
         if self.task.injects:

@@ -152,7 +152,7 @@ class SingleToyGrid(gymnasium.Env[NDArray[np.float32], Any]):
 
     def __init__(self, task: str = "rl2grid/bus14-T0-v0", *, normalize: str | None = "physical") -> None:
         self.task: Task = find_task(task)
-        self.options = SimpleNamespace(normalize=normalize)
+        self.options = SimpleNamespace(normalize=normalize, operator_features=None)
         vector = ToyGrid(1, continuous=self.task.kind == "R")
         self.observation_space = vector.single_observation_space
         self.action_space = vector.single_action_space

@@ -322,6 +322,7 @@ def test_what_cannot_be_learned_from_is_refused(tmp_path: Path):
         ({"gamma": 0.9}, {}, r"discounted by gamma=0\.99, not 0\.9: set gamma to the former"),
         ({}, {"heuristic": "idle"}, "of environments with heuristic=None, not idle"),
         ({}, {"normalize": None}, "of environments with normalize=physical, not None"),
+        ({}, {"operator_features": "trips"}, "of environments with operator_features=None, not trips"),
     ]
     for changes, keywords, message in cases:
         args = replace(Args(**SMALL, labels=(folder,)), **changes)

@@ -158,6 +158,12 @@ def test_other_observations_and_actions_are_refused():
     with pytest.raises(UsageError, match="normalize='physical' and cannot read observations of normalize=None"):
         agent.bind(SingleToyGrid(normalize=None))
     env = SingleToyGrid()
+    env.options.operator_features = "calendar"
+    with pytest.raises(
+        UsageError, match="operator_features=None and cannot read observations of operator_features='cal"
+    ):
+        agent.bind(env)
+    env = SingleToyGrid()
     env.action_space.n = np.int64(7)  # type: ignore[attr-defined]
     with pytest.raises(UsageError, match="chooses among 3 actions"):
         agent.bind(env)

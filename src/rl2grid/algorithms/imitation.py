@@ -64,6 +64,7 @@ from rl2grid.algorithms.sac import CategoricalActor, GaussianActor
 from rl2grid.algorithms.sampling import NEVER, legal_log_softmax
 from rl2grid.algorithms.trainer import Learner
 from rl2grid.arrays import F32, I64, Flags
+from rl2grid.envs.options import DEFAULTS, OBSERVED_WITH
 from rl2grid.envs.spec import Spec, spec_of
 from rl2grid.envs.tasks import find_task
 from rl2grid.errors import UsageError, one_of
@@ -589,8 +590,8 @@ def _labels_for(args: Args, spec: Spec, options: Any) -> tuple[LabelsDescription
     if spec.task is None:
         raise UsageError("Imitation learns tasks of rl2grid, whose observations and actions labels can name.")
     description, labels = read_labels([Path(args.with_seed(folder)) for folder in args.labels], spec.task)
-    for name in ("heuristic", "normalize", "reward"):
-        mine, theirs = getattr(options, name), description.env_keywords.get(name)
+    for name in ("heuristic", *OBSERVED_WITH, "reward"):
+        mine, theirs = getattr(options, name), description.env_keywords.get(name, DEFAULTS[name])
         if mine != theirs:
             raise UsageError(f"The labels are of environments with {name}={theirs}, not {mine}: train with the former.")
     if args.gamma != description.gamma:

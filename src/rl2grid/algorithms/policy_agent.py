@@ -19,7 +19,7 @@ from rl2grid.algorithms.pretrained import is_pretrained, pretrained
 from rl2grid.algorithms.registry import find_algorithm
 from rl2grid.envs.joint import JointAsBox, JointAsDiscrete
 from rl2grid.envs.normalization import ObservationNormalizer
-from rl2grid.envs.options import changed_options
+from rl2grid.envs.options import DEFAULTS, OBSERVED_WITH, changed_options
 from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
 from rl2grid.records.trainings import RUN_FILE, is_run, read_configuration
@@ -54,7 +54,7 @@ class PolicyAgent:
         self.task: str = contents["task"]
         self.env_keywords: dict[str, Any] = changed_options(contents["env_keywords"])
         """Keywords of the environments that it was trained in, those at their defaults left out: play it with the same
-        ``heuristic`` and ``normalize``, unless the difference is what is studied."""
+        ``heuristic``, unless the difference is what is studied."""
         self.deterministic = deterministic
         self._network = find_algorithm(contents["algorithm"]).load_policy(policy)
         self._mask_actions = bool(policy["mask_actions"])
@@ -84,12 +84,13 @@ class PolicyAgent:
         task = base.task.id
         if task != self.task:
             raise UsageError(f"The policy was trained on task {self.task!r} and cannot play task {task!r}.")
-        trained, offered = self.env_keywords.get("normalize", "physical"), base.options.normalize
-        if trained != offered:
-            raise UsageError(
-                f"The policy was trained with normalize={trained!r} and cannot read observations of "
-                f"normalize={offered!r}: make the environment with the former."
-            )
+        for name in OBSERVED_WITH:
+            trained, offered = self.env_keywords.get(name, DEFAULTS[name]), getattr(base.options, name)
+            if trained != offered:
+                raise UsageError(
+                    f"The policy was trained with {name}={trained!r} and cannot read observations of "
+                    f"{name}={offered!r}: make the environment with the former."
+                )
         self._flattened = _flattened(env, self._network.continuous)
         self._env: Any = self._flattened or base
         size = env.observation_space.shape

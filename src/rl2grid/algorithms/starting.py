@@ -74,11 +74,11 @@ class StartingPolicy:
         """
         theirs, mine = self.policy["factory"]["spec"], spec.state_dict()
         for name, words in _WORDS.items():
-            if theirs[name] != mine[name]:
+            if theirs.get(name) != mine[name]:
                 if name == "continuous" and theirs["task"] is not None:
                     way = "box" if theirs[name] else "discrete"
                     raise self.refusal(f"it plays joint actions otherwise: set joint_actions to {way}")
-                raise self.refusal(f"it has {words.format(theirs[name])}, here are {words.format(mine[name])}")
+                raise self.refusal(f"it has {words.format(theirs.get(name))}, here are {words.format(mine[name])}")
         network = self.policy["factory"]["name"]
         if network != args.network:
             raise self.refusal(f"its network is {network!r}, not {args.network!r}: set network to the former")
@@ -105,6 +105,7 @@ class StartingPolicy:
 _WORDS = {
     "task": "task {}",
     "normalize": "observations of normalize={}",
+    "operator_features": "observations with operator_features={}",
     "observation_size": "{} observed features",
     "continuous": "continuous={} actions",
     "action_size": "{} actions",

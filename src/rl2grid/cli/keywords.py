@@ -26,7 +26,8 @@ AGENT_HELP = (
 def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add a flag for each of :data:`NAMES`; those that are not given leave no trace."""
     group = parser.add_argument_group(
-        "environment", "keywords of the environment; heuristic and normalize are by default those of a trained policy"
+        "environment",
+        "keywords of the environment; the heuristic and what is observed are by default those of a trained policy",
     )
     for option in options_without(*GIVEN_OTHERWISE):
         choices = option.metadata.get("choices")

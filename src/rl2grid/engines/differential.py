@@ -52,7 +52,7 @@ COMPARED: tuple[str, ...] = (
 """What is compared after every step; sums hold that step alone. ``final_topo_vect`` joins them at a game over
 that a power flow decided: without a feasible dispatch none is run, and it has no meaning."""
 
-_COUNTED = ("n_steps", "decisions", "reset_steps", "open_since", "split_since")
+_COUNTED = ("n_steps", "decisions", "reset_steps", "open_since", "split_since", "attacked_at")
 _SUMMED = (
     *("transition_reward", "transition_discounted", "transition_components", "transition_costs"),
     *("reset_reward", "reset_components", "reset_costs", "episode_return", "episode_costs", "episode_scores"),

@@ -9,6 +9,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from rl2grid.envs.options import TaskOptions
 from rl2grid.envs.tasks import Task
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
@@ -101,9 +102,11 @@ def one_by_one(task: Task, actions: Any) -> Iterable[Any]:
     return [{TOPOLOGY: topology, INJECTION: injection} for topology, injection in pairs]
 
 
-def single_spaces(task: Task) -> tuple[gymnasium.spaces.Box, gymnasium.Space[Any]]:
-    """Observation and action space of one environment."""
-    size = observation_size(task.grid, task.kind)
+def single_spaces(
+    task: Task, operator_features: str | None = None
+) -> tuple[gymnasium.spaces.Box, gymnasium.Space[Any]]:
+    """Observation and action space of one environment; ``operator_features``: the keyword of ``gymnasium.make``."""
+    size = observation_size(task.grid, task.kind, operator_features)
     observations = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
     parts: dict[str, gymnasium.Space[Any]] = {}
     if task.changes_topology:
@@ -121,6 +124,7 @@ class TaskDescription:
     """What the single and the vector environment say about their task."""
 
     task: Task
+    options: TaskOptions
 
     @property
     def grid(self) -> Grid:
@@ -130,7 +134,7 @@ class TaskDescription:
     @property
     def observation_slices(self) -> dict[str, slice]:
         """Where each feature lies in an observation."""
-        return feature_slices(self.task.grid, self.task.kind)
+        return feature_slices(self.task.grid, self.task.kind, self.options.operator_features)
 
     @property
     def action_catalogue_ids(self) -> NDArray[np.int32]:

@@ -12,7 +12,7 @@ name              shape                        dtype   meaning
 ``edge_index``    [2, 2 n_line]                int64   source and target node (PyTorch Geometric's convention)
 ``edges``         [2 n_line, feature]          float32 features of the line, see below
 ``edge_mask``     [2 n_line]                   int8    0 for a line out of service; its index then names busbars 1
-``t``             [1]                          float32 share of the episode
+``t``             [1], or [7] with a calendar  float32 share of the episode, and the calendar
 ================= ============================ ======= ==============================================================
 
 A graph has what the flat observation has, and no flows in MW, which that lacks. Features, in this order:
@@ -34,7 +34,8 @@ of the renewable generators                               MW          R H    the
 ========================================================= =========== ====== ======================================
 
 Edge features are ``rho``, ``time_before_cooldown_line``, ``timestep_overflow`` (T, H), ``time_next_maintenance`` and
-``duration_next_maintenance``, as in the flat observation, and ``forward``, 1 from origin to extremity.
+``duration_next_maintenance``, as in the flat observation, operator features of lines where they are observed, and
+``forward``, 1 from origin to extremity.
 
 Tasks ``R`` do not observe the topology, but cannot divide a substation either: all elements are on busbar 1, and a
 line is in service where it carries current. After a game over no busbar and no line is in use.
@@ -52,7 +53,14 @@ from numpy.typing import NDArray
 
 from rl2grid.envs.tasks import Task
 from rl2grid.errors import UsageError
-from rl2grid.mdp.features import changes_topology, feature_slices, injects, physical_scale
+from rl2grid.mdp.features import (
+    OPERATOR_FEATURES,
+    changes_topology,
+    feature_slices,
+    injects,
+    operator_groups,
+    physical_scale,
+)
 
 Graph = dict[str, NDArray[Any]]
 """The arrays of the module's first table; those of many environments have them as first axis."""
@@ -88,25 +96,35 @@ class _Nodes(NamedTuple):
 class GraphBuilder:
     """Makes graphs of the flat observations of one task."""
 
-    def __init__(self, task: Task, normalize: str | None = "physical") -> None:
-        """``normalize``: the keyword with which the observations were made."""
+    def __init__(self, task: Task, normalize: str | None = "physical", operator_features: str | None = None) -> None:
+        """``normalize``, ``operator_features``: the keywords with which the observations were made."""
         grid = task.grid
         self._grid, self._kind = grid, task.kind
-        self._slices = feature_slices(grid, task.kind)
-        shift, scale = physical_scale(grid, task.kind)
+        self._slices = feature_slices(grid, task.kind, operator_features)
+        shift, scale = physical_scale(grid, task.kind, operator_features)
+        groups = operator_groups(operator_features)
+        times = OPERATOR_FEATURES["calendar"] if "calendar" in groups else ()
+        of_lines = [name for group in groups if group != "calendar" for name in OPERATOR_FEATURES[group]]
         self._physical = normalize == "physical"
         self._shift, self._scale = (shift, scale) if self._physical else (np.zeros_like(shift), np.ones_like(scale))
         self.node_features: tuple[str, ...] = _NODE_FEATURES[task.kind]
         """Names of the columns of ``nodes``."""
-        self.edge_features: tuple[str, ...] = _EDGE_FEATURES[task.kind]
+        *of_edges, forward = _EDGE_FEATURES[task.kind]
+        self.edge_features: tuple[str, ...] = (*of_edges, *of_lines, forward)
         """Names of the columns of ``edges``."""
+        self.time_features: tuple[str, ...] = ("t", *times)
+        """Names of the entries of ``t``."""
         self._node_scale = self._scale_of_nodes()
 
     @property
     def space(self) -> gymnasium.spaces.Dict:
         """The space of the graph of one observation."""
         n, m = 2 * self._grid.n_sub, 2 * self._grid.n_line
-        real = {"nodes": (n, len(self.node_features)), "edges": (m, len(self.edge_features)), "t": (1,)}
+        real = {
+            "nodes": (n, len(self.node_features)),
+            "edges": (m, len(self.edge_features)),
+            "t": (len(self.time_features),),
+        }
         boxes: dict[str, gymnasium.Space[Any]] = {
             name: gymnasium.spaces.Box(-np.inf, np.inf, shape, np.float32) for name, shape in real.items()
         }
@@ -133,7 +151,7 @@ class GraphBuilder:
             "edge_index": self._edge_index(places, in_service),
             "edges": self._edge_values(observations),
             "edge_mask": np.tile(in_service, 2).astype(np.int8),
-            "t": observations[:, self._slices["t"]].copy(),
+            "t": np.concatenate([observations[:, self._slices[name]] for name in self.time_features], axis=1),
         }
 
     def _topology(self, features: dict[str, NDArray[np.float64]]) -> NDArray[np.int64]:
@@ -265,4 +283,4 @@ def _builder(env: Any) -> GraphBuilder:
         raise UsageError(f"{type(base).__name__} is no task of rl2grid: only those have graphs.")
     if env.observation_space.shape != base.observation_space.shape or env.observation_space.dtype != np.float32:
         raise UsageError("Graphs are made of flat observations: wrap the task before other wrappers change them.")
-    return GraphBuilder(base.task, base.options.normalize)
+    return GraphBuilder(base.task, base.options.normalize, base.options.operator_features)

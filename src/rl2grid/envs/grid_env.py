@@ -64,8 +64,8 @@ class PowerGridEnv(RowMethods, gymnasium.Env[NDArray[np.float32], Any]):
     | `time_next_maintenance`, `duration_next_maintenance` | lines | steps | T, R, H |
     | `storage_charge`, `storage_power_target`, `storage_power`, `storage_theta` | storages | MWh, MW, MW, degrees | where the grid has storage |
 
-    With `normalize="physical"` (the default) every entry is divided by a constant of the grid; see
-    :mod:`rl2grid.mdp.features`.
+    With `normalize="physical"` (the default) every entry is divided by a constant of the grid. `operator_features` adds
+    the calendar, steps to trips, attacks, and what losses would do. See :mod:`rl2grid.mdp.features`.
 
     ## Rewards
     `reward="default"`: 1 for surviving, minus half the mean overload, minus half the normalised cost, per
@@ -106,7 +106,7 @@ class PowerGridEnv(RowMethods, gymnasium.Env[NDArray[np.float32], Any]):
         self.task = find_task(task)
         self.options = options_of(self.task, keywords, keyword_names(type(self)))
         self._environments = TaskEnvironments(self.task, self.options, 1)
-        observations, self.action_space = single_spaces(self.task)
+        observations, self.action_space = single_spaces(self.task, self.options.operator_features)
         self.observation_space = cast("gymnasium.Space[NDArray[np.float32]]", observations)
 
     @property

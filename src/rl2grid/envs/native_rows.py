@@ -18,6 +18,7 @@ from rl2grid.envs.task_environments import StreamPosition
 from rl2grid.envs.tasks import Task
 from rl2grid.grids import find_system
 from rl2grid.mdp.actions import DO_NOTHING, INJECTION, TOPOLOGY
+from rl2grid.mdp.features import observation_size
 from rl2grid.scenarios.episodes import MAX_STEPS, EpisodePlan
 from rl2grid.scenarios.months import GeneratedScenarios
 from rl2grid.scenarios.splits import TRAIN
@@ -41,6 +42,8 @@ class NativeRows(EngineRows[Commands]):
             if task.injects:
                 kinds, targets, masks = self._changes
                 self._injections = replace(self._injections, kinds=kinds, targets=targets, masks=masks)
+        first = observation_size(task.grid, task.kind)
+        self._engine_normaliser = tuple(constants[:first] for constants in self._normaliser)
         self._buffers = [np.zeros((n, self._size), np.float32) for _ in range(2)]
         self._last = np.zeros((n, self._size), np.float32)
 
@@ -97,12 +100,18 @@ class NativeRows(EngineRows[Commands]):
 
     def _observations(self) -> NDArray[np.float32]:
         self._buffers.reverse()
-        self.transitions.write_observations(self._rows, *self._normaliser, self._buffers[0])
+        self._write_observations(self._rows, self._buffers[0])
         return self._buffers[0]
 
     def _last_observations(self, rows: I64) -> NDArray[np.float32]:
-        self.transitions.write_observations(rows, *self._normaliser, self._last)
+        self._write_observations(rows, self._last)
         return self._last[rows]
+
+    def _write_observations(self, rows: I64, out: F32) -> None:
+        shift, scale = self._engine_normaliser
+        self.transitions.write_observations(rows, shift, scale, out)
+        if self._operator is not None:
+            self._operator.write(self._state_address, rows, out)
 
     def _choices(self, ids: Any, actions: Any) -> tuple[I64, I64]:
         """Topology actions as the engine takes them: the first change of each and the one behind its last, int64 [n].

@@ -15,6 +15,7 @@ from rl2grid.engines import DISPATCHES, ENGINES, HEURISTICS
 from rl2grid.envs.tasks import Task, constraint_of
 from rl2grid.errors import UsageError, one_of
 from rl2grid.mdp.constraint_table import CONSTRAINTS
+from rl2grid.mdp.features import operator_groups
 from rl2grid.scenarios.episodes import MAX_STEPS
 from rl2grid.scenarios.splits import SPLITS
 
@@ -69,6 +70,9 @@ class TaskOptions:
     """Play this scenario only."""
     normalize: str | None = field(default="physical", metadata=_one_of("physical", None))
     """``"physical"``: divide observations by constants of the grid; None: physical units."""
+    operator_features: str | None = field(default=None, metadata={"check": operator_groups})
+    """What is observed beside the paper's features: some of ``"calendar"``, ``"trips"``, ``"attacks"`` and
+    ``"security"``, separated by commas, or ``"all"``; None: nothing."""
     dispatch: str = field(default="exact", metadata=_one_of(*DISPATCHES))
     """How redispatch is solved: ``"exact"``, or ``"grid2op"`` with Grid2Op's own solver."""
     constraint: str | None = field(default=None, metadata=_one_of(None, *CONSTRAINTS))
@@ -87,6 +91,8 @@ class TaskOptions:
             _check(option, getattr(self, option.name))
 
 
+OBSERVED_WITH: tuple[str, ...] = ("normalize", "operator_features")
+"""Keywords that decide what is observed: a policy reads what it was trained with."""
 OPTION_NAMES: tuple[str, ...] = tuple(option.name for option in fields(TaskOptions))
 """All keywords."""
 
@@ -143,10 +149,13 @@ def options_of(task: Task, keywords: Mapping[str, Any], allowed: Iterable[str] =
     return dataclasses.replace(options, constraint=constraint_of(task, options.constraint))
 
 
+DEFAULTS: Mapping[str, Any] = {option.name: option.default for option in fields(TaskOptions)}
+"""The value of each keyword that is not given."""
+
+
 def changed_options(keywords: Mapping[str, Any]) -> dict[str, Any]:
     """The keywords that are not at their defaults: those filled in to be stored do not count as asked for."""
-    defaults = {option.name: option.default for option in fields(TaskOptions)}
-    return {name: value for name, value in keywords.items() if name not in defaults or value != defaults[name]}
+    return {name: value for name, value in keywords.items() if name not in DEFAULTS or value != DEFAULTS[name]}
 
 
 def shows_options(init: Function) -> Function:

@@ -165,7 +165,7 @@ class RowView(RowMethods):
     def __init__(self, environments: TaskEnvironments, i: int) -> None:
         self._environments, self._i = environments, i
         self.task, self.options = environments.task, environments.options
-        self.observation_space, self.action_space = single_spaces(self.task)
+        self.observation_space, self.action_space = single_spaces(self.task, self.options.operator_features)
 
     @property
     def state(self) -> GridState:

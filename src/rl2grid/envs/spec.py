@@ -21,7 +21,7 @@ from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
 from rl2grid.mdp.actions import ActionCatalogue, ContinuousLayout, continuous_layout, level_catalogue
-from rl2grid.mdp.features import feature_slices, physical_scale
+from rl2grid.mdp.features import OPERATOR_FEATURES, feature_slices, physical_scale
 
 ELEMENTS = ("time", "gen", "load", "line", "element", "sub", "storage")
 """What entries of an observation can belong to; ``element`` is an entry of the topology vector."""
@@ -40,6 +40,8 @@ _OF = {
     "actual_dispatch": "gen",
     "curtailment": "gen",
     "curtailment_limit": "gen",
+    **dict.fromkeys(OPERATOR_FEATURES["calendar"], "time"),
+    **{name: "line" for group in ("trips", "attacks", "security") for name in OPERATOR_FEATURES[group]},
 }
 """Features whose name does not begin with what they are of."""
 
@@ -78,6 +80,8 @@ class Spec:
     """Id of the task of rl2grid; None: another environment, of which there is nothing below."""
     normalize: str | None = None
     """The keyword with which observations are made."""
+    operator_features: str | None = None
+    """Likewise."""
     features: tuple[Feature, ...] = ()
     """The observation from its first to its last entry."""
     shift: NDArray[np.float32] | None = None
@@ -110,7 +114,7 @@ class Spec:
         """
         if self.task is None:
             raise UsageError("Only tasks of rl2grid have graphs: this environment has no grid.")
-        return GraphBuilder(find_task(self.task), self.normalize)
+        return GraphBuilder(find_task(self.task), self.normalize, self.operator_features)
 
     def state_dict(self) -> dict[str, Any]:
         """Plain values from which :func:`spec_from_state` makes it again."""
@@ -120,14 +124,15 @@ class Spec:
             "continuous": self.continuous,
             "task": self.task,
             "normalize": self.normalize,
+            "operator_features": self.operator_features,
         }
 
 
-def task_spec(task: Task, normalize: str | None = "physical") -> Spec:
-    """The spec of environments of a task; ``normalize`` as they are made with."""
+def task_spec(task: Task, normalize: str | None = "physical", operator_features: str | None = None) -> Spec:
+    """The spec of environments of a task; ``normalize`` and ``operator_features`` as they are made with."""
     grid, kind = task.grid, task.kind
-    slices = feature_slices(grid, kind)
-    shift, scale = physical_scale(grid, kind)
+    slices = feature_slices(grid, kind, operator_features)
+    shift, scale = physical_scale(grid, kind, operator_features)
     if normalize != "physical":
         shift, scale = np.zeros_like(shift), np.ones_like(scale)
     for array in (shift, scale):
@@ -138,6 +143,7 @@ def task_spec(task: Task, normalize: str | None = "physical") -> Spec:
         continuous=task.injects,
         task=task.id,
         normalize=normalize,
+        operator_features=operator_features,
         features=tuple(Feature(name, part.start, part.stop, _element(name)) for name, part in slices.items()),
         shift=shift,
         scale=scale,
@@ -181,7 +187,9 @@ def spec_of(env: Any) -> Spec:
         )
     else:
         raise UsageError(f"Policies play Discrete actions and vectors, not {actions}.")
-    return _with_task(sizes, task, base.options.normalize) if isinstance(task, Task) else sizes
+    if not isinstance(task, Task):
+        return sizes
+    return _with_task(sizes, task_spec(task, base.options.normalize, base.options.operator_features))
 
 
 def spec_from_state(state: Mapping[str, Any]) -> Spec:
@@ -191,14 +199,20 @@ def spec_from_state(state: Mapping[str, Any]) -> Spec:
         UsageError: there is no such task any more.
     """
     sizes = Spec(state["observation_size"], state["action_size"], state["continuous"])
-    return sizes if state["task"] is None else _with_task(sizes, find_task(state["task"]), state["normalize"])
+    if state["task"] is None:
+        return sizes
+    # Policies that were stored before there were such features do not name them.
+    return _with_task(sizes, task_spec(find_task(state["task"]), state["normalize"], state.get("operator_features")))
 
 
-def _with_task(sizes: Spec, task: Task, normalize: str | None) -> Spec:
-    spec = task_spec(task, normalize)
+def _with_task(sizes: Spec, spec: Spec) -> Spec:
+    """What a task defines, where the sizes are those of the task."""
+    assert spec.task is not None
+    task = find_task(spec.task)
     if task.kind == "H" and not sizes.continuous and sizes.action_size == discrete_of(task).n:
         spec = replace(spec, action_size=sizes.action_size, continuous=False)
-    return spec if spec.state_dict() == {**sizes.state_dict(), "task": task.id, "normalize": normalize} else sizes
+    mine, theirs = ((each.observation_size, each.action_size, each.continuous) for each in (spec, sizes))
+    return spec if mine == theirs else sizes
 
 
 def _element(feature: str) -> str:

@@ -18,16 +18,18 @@ from rl2grid.engines.worlds import Standing, Trail, World
 from rl2grid.envs.description import action_number, step_action, task_catalogue
 from rl2grid.envs.info import episode_info
 from rl2grid.envs.operation import Operation, operation_of
+from rl2grid.envs.operator_features import OperatorFeatures
 from rl2grid.envs.options import TaskOptions
 from rl2grid.envs.tasks import Task
 from rl2grid.errors import UsageError
+from rl2grid.handles import Handle
 from rl2grid.mdp.actions import (
     ActionCatalogue,
     StepAction,
     action_set_hash,
     legal_actions,
 )
-from rl2grid.mdp.features import feature_slices, observation_size, physical_scale
+from rl2grid.mdp.features import feature_slices, physical_scale
 from rl2grid.mdp.legality import verdict_on
 from rl2grid.mdp.observations import observation_writer
 from rl2grid.mdp.rewards import resolve_reward, reward_name
@@ -98,9 +100,15 @@ class TaskEnvironments:
         self.transitions = make_transitions(task, options, n)
         self.engine: Engine = self.transitions.engine
         self._write_observation = observation_writer(task.kind)
-        shift, scale = physical_scale(self.grid, task.kind)
-        physical = options.normalize == "physical"
-        self._normaliser = (shift, scale) if physical else (np.zeros_like(shift), np.ones_like(scale))
+        shift, scale = physical_scale(self.grid, task.kind, options.operator_features)
+        if options.normalize != "physical":
+            shift, scale = np.zeros_like(shift), np.ones_like(scale)
+        self._size = len(shift)
+        self._normaliser = shift, scale
+        self._operator: OperatorFeatures | None = None
+        if options.operator_features is not None:
+            self._operator = OperatorFeatures(task, options.operator_features, self.engine, shift, scale)
+        self._state_handle = Handle(self.state)
         self._catalogue = task_catalogue(task, self.grid)
         self._hash = action_set_hash(self.grid, task.level) if task.changes_topology else None
         self._plans: list[EpisodePlan | None] = [None] * n
@@ -153,17 +161,18 @@ class TaskEnvironments:
 
     def write_observation(self, i: int, out: NDArray[np.float32]) -> None:
         """Write the observation of row ``i`` to ``out``, float32 [feature]."""
-        self._observe(self.transitions.opened_state, i, out)
+        self._observe(i, out)
+        self._scale(out)
 
     def observe(self, i: int, scaled: bool) -> dict[str, NDArray[np.float32]]:
         """The observation of row ``i`` by name; see :meth:`rl2grid.envs.row_view.RowMethods.observe`."""
         self._position(i)
-        values = np.zeros(observation_size(self.grid, self.task.kind), np.float32)
+        values = np.zeros(self._size, np.float32)
+        self._observe(i, values)
         if scaled:
-            self.write_observation(i, values)
-        else:
-            self._write_observation(self.transitions.opened_state, i, values)
-        return {name: values[part] for name, part in feature_slices(self.grid, self.task.kind).items()}
+            self._scale(values)
+        slices = feature_slices(self.grid, self.task.kind, self.options.operator_features)
+        return {name: values[part] for name, part in slices.items()}
 
     def reward(self, i: int) -> float:
         """Sum of the rewards of the last transition."""
@@ -202,8 +211,11 @@ class TaskEnvironments:
             raise UsageError("There is no episode in progress to simulate from: call reset first.")
         effect = refusal(self.grid, verdict_on(self.state, i, played))
         result = self.transitions.simulate(i, played, horizon)
-        observation = np.zeros(observation_size(self.grid, self.task.kind), np.float32)
-        self._observe(self.transitions.opened_result(result), 0, observation)
+        observation = np.zeros(self._size, np.float32)
+        self._write_observation(self.transitions.opened_result(result), 0, observation)
+        if self._operator is not None:
+            self._operator.write_raw(Handle(result).address, 0, i, observation)
+        self._scale(observation)
         info = {**_start_info(plan), **episode_info(result, 0, self.constraint)}
         info["action_effect"] = effect or clipping(self.grid, result, 0, played)
         reward = float(result.transition_reward[0])
@@ -391,6 +403,9 @@ class TaskEnvironments:
     def _take(self, i: int, position: StreamPosition, plan: EpisodePlan) -> None:
         """Move row ``i`` to an episode of its stream."""
         self._positions[i], self._plans[i] = position, plan
+        if self._operator is not None:
+            began = open_series(self.grid.id, plan.scenario_id).start_datetime + plan.start * STEP
+            self._operator.begin(i, began)
         self.imagined[i], self.foresight[i] = False, 0
         self._trails.pop(i, None)
 
@@ -419,11 +434,23 @@ class TaskEnvironments:
             episode_length=self.options.episode_length,
         )
 
-    def _observe(self, state: GridState, i: int, out: NDArray[np.float32]) -> None:
+    def _observe(self, i: int, out: NDArray[np.float32]) -> None:
+        """Write what is observed of row ``i``, in raw units."""
+        self._write_observation(self.transitions.opened_state, i, out)
+        if self._operator is not None:
+            self._operator.write_raw(self._state_address, i, i, out)
+
+    def _scale(self, out: NDArray[np.float32]) -> None:
         shift, scale = self._normaliser
-        self._write_observation(state, i, out)
         out -= shift
         out /= scale
+
+    @property
+    def _state_address(self) -> int:
+        """Where compiled code finds the state."""
+        if self._state_handle.structure is not self.state:
+            self._state_handle = Handle(self.state)
+        return self._state_handle.address
 
     def _step_action(self, action: Any) -> StepAction:
         return step_action(self.task, self.grid, self._catalogue, action)

@@ -63,7 +63,8 @@ class PowerGridVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], Any, ND
         self.task = find_task(task)
         self.options = options_of(self.task, keywords, keyword_names(type(self)))
         self.num_envs = num_envs
-        self.single_observation_space, self.single_action_space = single_spaces(self.task)
+        observations, actions = single_spaces(self.task, self.options.operator_features)
+        self.single_observation_space, self.single_action_space = observations, actions
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._attributes: dict[str, tuple[Any, ...]] = {}

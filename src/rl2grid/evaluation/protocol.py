@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from rl2grid.agents.agent import Agent
-from rl2grid.envs.options import TaskOptions, options_of
+from rl2grid.envs.options import OBSERVED_WITH, TaskOptions, options_of
 from rl2grid.envs.tasks import Task, constraint_of, find_task
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import make_agent
@@ -181,8 +181,9 @@ def env_keywords(agent: Agent, keywords: dict[str, Any]) -> dict[str, Any]:
     trained: Mapping[str, Any] = getattr(agent, "env_keywords", {})
     if keywords["heuristic"] == AS_TRAINED:
         keywords["heuristic"] = trained.get("heuristic")
-    if "normalize" in trained:
-        keywords.setdefault("normalize", trained["normalize"])
+    for name in OBSERVED_WITH:
+        if name in trained:
+            keywords.setdefault(name, trained[name])
     unknown = sorted(set(keywords) - set(TaskOptions.__dataclass_fields__))
     if unknown:
         allowed = ", ".join(TaskOptions.__dataclass_fields__)

@@ -16,6 +16,7 @@ from __future__ import annotations
 from rl2grid.compile import jit
 from rl2grid.mdp.constraints import step_costs, update_excused
 from rl2grid.mdp.operation import accrue_operation
+from rl2grid.mdp.operator_features import note_attacks
 from rl2grid.mdp.scores import margin_score, overload_score, topology_score
 from rl2grid.mdp.state import (
     COST,
@@ -94,6 +95,7 @@ def accrue(
     _add(state.transition_components[i], state.episode_components[i], OVERLOAD, overload)
     _add(state.transition_components[i], state.episode_components[i], COST, cost)
     update_excused(state, i)
+    note_attacks(state, i)
     costs = step_costs(state, i)
     for column in range(len(costs)):
         _add(state.transition_costs[i], state.episode_costs[i], column, costs[column])

@@ -33,6 +33,26 @@ feature                                                 unit      tasks  shift s
 
 What writes them is :mod:`rl2grid.mdp.observations`: this table compiles nothing.
 
+With the keyword ``operator_features`` come, behind these, what an operator knows and the paper's observation lacks. Its
+value names groups, separated by commas, or is ``"all"``; in all tasks:
+
+============ ======================================================= ========= ====== =================================
+group        feature                                                 unit      shift  scale
+============ ======================================================= ========= ====== =================================
+``calendar`` ``day_sine``, ``day_cosine``, ``week_sine``,            1         0      1
+             ``week_cosine``, ``year_sine``, ``year_cosine``
+``trips``    ``steps_to_trip``                                       steps     0      ``rules.overflow_allowed`` + 1
+``attacks``  ``attacked``                                            0 or 1    0      1
+``attacks``  ``steps_since_attack``                                  steps     0      a day, 288
+``security`` ``loading_after_loss``                                  1         0      1
+============ ======================================================= ========= ====== =================================
+
+The calendar tells how far the day, the week (from Monday) and the year have gone, as an angle. The others have an entry
+for each line: the steps after which the protections open it if it stays overloaded (all that it may take where it is
+not); whether the opponent holds it; steps since it last did (a day where that is longer ago, or never was in this
+episode); and how much the worst line is loaded after the loss of this one, by :mod:`rl2grid.mdp.security`, at most 2 (2
+also where the grid falls apart), and 0 for what need not be expected to be lost now.
+
 The storage features exist where the grid has storage. The longest cooldown of a line is what a switch, a
 protection, an attack or a day's maintenance can set. Where the constant of an element is 0 (a generator
 without ramp, a load that is always 0, a rule without cooldown) the scale is 1: the entry stays in its unit.
@@ -47,46 +67,56 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rl2grid.arrays import F32
-from rl2grid.errors import one_of
+from rl2grid.errors import UsageError, one_of
 from rl2grid.grids import STEPS_PER_HOUR, Grid
 
 KINDS: tuple[str, ...] = ("T", "R", "H")
 """Topology tasks, redispatching tasks, and joint tasks of both."""
 
-_WEEK = 7 * 24 * STEPS_PER_HOUR
+OPERATOR_FEATURES: dict[str, tuple[str, ...]] = {
+    "calendar": ("day_sine", "day_cosine", "week_sine", "week_cosine", "year_sine", "year_cosine"),
+    "trips": ("steps_to_trip",),
+    "attacks": ("attacked", "steps_since_attack"),
+    "security": ("loading_after_loss",),
+}
+"""Features of each group that may be observed beside those of the paper, in this order."""
+ALL_GROUPS = "all"
+
+_DAY = 24 * STEPS_PER_HOUR
+_WEEK = 7 * _DAY
 _HALF_TURN = 180.0
 
 
-def feature_slices(grid: Grid, kind: str) -> dict[str, slice]:
+def feature_slices(grid: Grid, kind: str, operator_features: str | None = None) -> dict[str, slice]:
     """Where each feature lies in an observation of a task of this kind, in order.
 
+    Args:
+        grid: the grid.
+        kind: of task.
+        operator_features: groups that are observed as well; see :func:`operator_groups`.
+
     Raises:
-        UsageError: ``kind`` is none of :data:`KINDS`.
+        UsageError: ``kind`` is none of :data:`KINDS`, or there is no such group.
     """
     slices: dict[str, slice] = {}
     begin = 0
-    for name, _, scale in _layout(grid, kind):
+    for name, _, scale in _layout(grid, kind, operator_features):
         slices[name] = slice(begin, begin + len(scale))
         begin += len(scale)
     return slices
 
 
-def observation_size(grid: Grid, kind: str) -> int:
-    """Number of entries of an observation.
+def observation_size(grid: Grid, kind: str, operator_features: str | None = None) -> int:
+    """Number of entries of an observation; arguments and errors as of :func:`feature_slices`."""
+    return sum(len(scale) for _, _, scale in _layout(grid, kind, operator_features))
 
-    Raises:
-        UsageError: ``kind`` is none of :data:`KINDS`.
+
+def physical_scale(grid: Grid, kind: str, operator_features: str | None = None) -> tuple[F32, F32]:
+    """``shift`` and ``scale``, float32 [feature], of the module's tables; no scale is 0.
+
+    Arguments and errors are those of :func:`feature_slices`.
     """
-    return sum(len(scale) for _, _, scale in _layout(grid, kind))
-
-
-def physical_scale(grid: Grid, kind: str) -> tuple[F32, F32]:
-    """``shift`` and ``scale``, float32 [feature], of the module's table; no scale is 0.
-
-    Raises:
-        UsageError: ``kind`` is none of :data:`KINDS`.
-    """
-    layout = _layout(grid, kind)
+    layout = _layout(grid, kind, operator_features)
     shift = np.concatenate([np.full(len(scale), shift, np.float32) for _, shift, scale in layout])
     scale = np.concatenate([scale for _, _, scale in layout])
     return shift, np.where(scale > 0, scale, np.float32(1.0))
@@ -112,8 +142,27 @@ def check_kind(kind: str) -> None:
         raise one_of("Kind of task", kind, KINDS)
 
 
+def operator_groups(names: str | None) -> tuple[str, ...]:
+    """The groups of :data:`OPERATOR_FEATURES` that a value of the keyword names, in their order.
+
+    Raises:
+        UsageError: there is no such group, or one is named twice.
+    """
+    if names is None:
+        return ()
+    if names == ALL_GROUPS:
+        return tuple(OPERATOR_FEATURES)
+    given = names.split(",") if isinstance(names, str) else []
+    if not given or not set(given) <= set(OPERATOR_FEATURES) or len(set(given)) < len(given):
+        raise UsageError(
+            f"operator_features={names!r} is not allowed: give some of {', '.join(OPERATOR_FEATURES)}, separated by "
+            f"commas and each once, or {ALL_GROUPS}."
+        )
+    return tuple(group for group in OPERATOR_FEATURES if group in given)
+
+
 @functools.cache
-def _layout(grid: Grid, kind: str) -> tuple[tuple[str, float, F32], ...]:
+def _layout(grid: Grid, kind: str, operator_features: str | None) -> tuple[tuple[str, float, F32], ...]:
     """(name, shift, scale [entry]) of every feature, in order."""
     check_kind(kind)
     rows = (
@@ -121,6 +170,7 @@ def _layout(grid: Grid, kind: str) -> tuple[tuple[str, float, F32], ...]:
         *(_topology_features(grid) if changes_topology(kind) else ()),
         *(_redispatch_features(grid) if injects(kind) else ()),
         *_planned_and_stored_features(grid),
+        *(row for group in operator_groups(operator_features) for row in _operator_features(grid, group)),
     )
     return tuple((name, shift, np.atleast_1d(np.asarray(scale, np.float32))) for name, shift, scale in rows)
 
@@ -165,6 +215,12 @@ def _planned_and_stored_features(grid: Grid) -> Rows:
     yield "storage_power_target", 0.0, power
     yield "storage_power", 0.0, power
     yield "storage_theta", 0.0, np.full(grid.n_storage, _HALF_TURN)
+
+
+def _operator_features(grid: Grid, group: str) -> Rows:
+    of_lines = {"steps_to_trip": grid.rules.overflow_allowed + 1, "steps_since_attack": _DAY}
+    for name in OPERATOR_FEATURES[group]:
+        yield name, 0.0, 1.0 if group == "calendar" else np.full(grid.n_line, of_lines.get(name, 1.0))
 
 
 def _maintenance_window(grid: Grid) -> int:

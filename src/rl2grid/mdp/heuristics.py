@@ -98,9 +98,10 @@ def is_careful_enough(forecast: GridState, j: int) -> bool:
 
 @jit
 def remember_nothing(state: GridState, i: int) -> None:
-    """Begin an episode of row ``i`` for the careful heuristic."""
+    """Begin an episode of row ``i``: nothing was lost, split or attacked."""
     state.open_since[i] = -1
     state.split_since[i] = -1
+    state.attacked_at[i] = -1
 
 
 @jit

@@ -100,9 +100,10 @@ class GridState(NamedTuple):
     excused: Annotated[Flags, row("line", "left out of TLO, see `rl2grid.mdp.constraints`")]
     final_topo_vect: Annotated[I32, row("topo", "the topology with which a game over happened")]
 
-    # What the careful heuristic remembers; see `rl2grid.mdp.heuristics`.
+    # What heuristics and observations remember; see `rl2grid.mdp.heuristics` and `rl2grid.mdp.operator_features`.
     open_since: Annotated[I32, row("line", "step at which it was lost, -1 while in service")]
     split_since: Annotated[I32, row("sub", "step at which it was last split, -1 while all is on busbar 1")]
+    attacked_at: Annotated[I32, row("line", "last step at which it was out by the opponent, -1 before the first")]
 
     # Sums over the transition in progress (one agent step and the heuristic steps behind it).
     n_steps: Annotated[I32, row("", "grid steps of the transition")]

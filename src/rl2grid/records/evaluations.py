@@ -12,6 +12,7 @@ from pathlib import Path
 from types import NoneType
 from typing import Any
 
+from rl2grid.envs.options import OBSERVED_WITH
 from rl2grid.errors import UsageError
 from rl2grid.records.episodes import EPISODES_FILE, Episode, read_episodes
 from rl2grid.records.files import checksum, read_json, write_record
@@ -207,7 +208,7 @@ def check_comparable(results: Sequence[Evaluation]) -> None:
             )
 
 
-_MAY_DIFFER = frozenset({"agent", "agent_identity", "heuristic", "normalize"})
+_MAY_DIFFER = frozenset({"agent", "agent_identity", "heuristic", *OBSERVED_WITH})
 
 
 def _played(result: Evaluation) -> set[tuple[str, int, int]]:

@@ -18,6 +18,7 @@ from rl2grid.records.labels import (
     is_labels,
     label_shape,
     month_path,
+    observed_groups,
     read_labels_description,
     read_row,
     request_hash,
@@ -33,7 +34,8 @@ class LabelFolder:
         self.number = number
         """Of the round."""
         self._folder, self._description = folder, description
-        self._shape = label_shape(find_task(description["task"]), description["candidates"])
+        task = find_task(description["task"])
+        self._shape = label_shape(task, description["candidates"], observed_groups(description))
         self.request = request_hash(description, number)
         """What the files of its months must say."""
 

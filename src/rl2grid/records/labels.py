@@ -190,17 +190,24 @@ class LabelsDescription:
     ``labels``."""
 
 
-def label_shape(task: Task, candidates: int) -> LabelShape:
-    """The shape of the labels of a task."""
-    return LabelShape(observation_size(task.grid, task.kind), task.n_topology_actions, task.n_injections, candidates)
+def label_shape(task: Task, candidates: int, operator_features: str | None = None) -> LabelShape:
+    """The shape of the labels of a task whose environments observe these groups as well."""
+    observed = observation_size(task.grid, task.kind, operator_features)
+    return LabelShape(observed, task.n_topology_actions, task.n_injections, candidates)
 
 
-def task_identity(task: Task) -> dict[str, Any]:
+def observed_groups(description: Mapping[str, Any]) -> str | None:
+    """The operator features that the environments of labels observed."""
+    groups: str | None = description["env_keywords"].get("operator_features")
+    return groups
+
+
+def task_identity(task: Task, operator_features: str | None = None) -> dict[str, Any]:
     """What labels and whoever learns of them must agree on: the grid, its actions, what is observed."""
     return {
         "grid_hash": task.grid.hash,
         "action_set_hash": action_set_hash(task.grid, task.level) if task.changes_topology else None,
-        "observation_size": observation_size(task.grid, task.kind),
+        "observation_size": observation_size(task.grid, task.kind, operator_features),
     }
 
 
@@ -245,10 +252,9 @@ def read_labels(folders: Sequence[Path], task_id: str) -> tuple[LabelsDescriptio
         _check_task(folder, description, task)
         _check_together(folders[0], descriptions[0], folder, description)
     parts = [
-        read_month(
-            month_path(folder, number, month), label_shape(task, description["candidates"]), wanted, number, month
-        )
+        read_month(month_path(folder, number, month), shape, wanted, number, month)
         for folder, description in zip(folders, descriptions, strict=True)
+        for shape in [label_shape(task, description["candidates"], observed_groups(description))]
         for number, each in enumerate(description["rounds"])
         for wanted in [request_hash(description, number)]
         for month in _complete(folder, number, each)
@@ -488,7 +494,7 @@ def _complete(folder: Path, number: int, of_round: Mapping[str, Any]) -> Iterabl
 def _check_task(folder: Path, description: Mapping[str, Any], task: Task) -> None:
     if description["task"] != task.id:
         raise UsageError(f"{folder} holds labels of {description['task']}, not of {task.id}: label that task.")
-    now = task_identity(task)
+    now = task_identity(task, observed_groups(description))
     for name, words in _DEFINES.items():
         if description["identity"][name] != now[name]:
             raise UsageError(f"{folder} was labelled when {task.id} had other {words}: label its months again.")

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from rl2grid.envs.options import OBSERVED_WITH
 from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
 from rl2grid.mdp.constraint_table import CONSTRAINTS, THRESHOLDS
@@ -19,7 +20,7 @@ from rl2grid.records.summary import column_scores, safe_scores
 COSTS: dict[str, str] = {name: constraint.column for name, constraint in CONSTRAINTS.items()}
 """Column of each cost in the rows of episodes."""
 _OF_THE_TASK = frozenset({"task", "grid_hash", "scenario_pack_hash", "action_set_hash", "constraint"})
-_OF_THE_AGENT = frozenset({"agent", "agent_identity", "heuristic", "normalize"})
+_OF_THE_AGENT = frozenset({"agent", "agent_identity", "heuristic", *OBSERVED_WITH})
 
 
 @dataclass(frozen=True, eq=False)

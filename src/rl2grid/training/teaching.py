@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rl2grid.agents.agent import Agent
-from rl2grid.envs.options import TaskOptions, changed_options, options_of
+from rl2grid.envs.options import DEFAULTS, OBSERVED_WITH, TaskOptions, changed_options, options_of
 from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import make_agent
@@ -253,8 +253,8 @@ def _check_pupil(pupil: Agent | None, keywords: Mapping[str, Any]) -> None:
     trained = getattr(pupil, "env_keywords", None)
     if trained is None:
         return
-    for name in ("heuristic", "normalize"):
-        mine = trained.get(name, getattr(TaskOptions(), name))
+    for name in ("heuristic", *OBSERVED_WITH):
+        mine = trained.get(name, DEFAULTS[name])
         if mine != keywords[name]:
             raise UsageError(
                 f"The pupil was trained with {name}={mine!r}, and the labels are of {name}={keywords[name]!r}: choose "
@@ -300,7 +300,7 @@ def _request(setup: LabelSetup, seed: int) -> dict[str, Any]:
         "seed": seed,
         "candidates": setup.candidates,
         "identity": {
-            **task_identity(task),
+            **task_identity(task, setup.env_keywords["operator_features"]),
             "generator_version": generator_version(task.grid_id, TRAIN),
             "versions": library_versions(),
         },

@@ -55,7 +55,7 @@ from rl2grid.algorithms.networks.graph_functions import (
 from rl2grid.arrays import I32
 from rl2grid.envs.spec import Spec
 from rl2grid.envs.tasks import find_task
-from rl2grid.mdp.features import physical_scale
+from rl2grid.mdp.features import OPERATOR_FEATURES, operator_groups, physical_scale
 
 _URGENT_STEPS = 72.0
 """Steps after which planned maintenance counts e times less: six hours."""
@@ -79,7 +79,7 @@ class _Elements(NamedTuple):
     in_service: Tensor
     """[line, 1, batch]"""
     time: Tensor
-    """[1, batch]"""
+    """[entry, batch] the share of the episode that is over, and the calendar where it is observed"""
 
 
 class Features(nn.Module):
@@ -97,9 +97,12 @@ class Features(nn.Module):
         self.has_topology = "topo_vect" in self.slices
         of_gens = [feature.name for feature in spec.features if feature.of == "gen"]
         self.dispatch = [name for name in of_gens if name not in ("gen_p", "gen_theta")]
+        known = operator_groups(spec.operator_features)
+        self.of_lines = [name for group in known if group != "calendar" for name in OPERATOR_FEATURES[group]]
+        self.times = [feature.name for feature in spec.features if feature.of == "time"]
         self.of_storage = [feature.name for feature in spec.features if feature.of == "storage"]
         self.reads_action = reads_action
-        shift, scale = physical_scale(grid, find_task(spec.task).kind)
+        shift, scale = physical_scale(grid, find_task(spec.task).kind, spec.operator_features)
         ends = (grid.line_or_pos_topo_vect, grid.line_ex_pos_topo_vect)
         others = (grid.gen_pos_topo_vect, grid.load_pos_topo_vect, grid.storage_pos_topo_vect)
         largest = float(grid.gen_pmax.max())
@@ -130,7 +133,7 @@ class Features(nn.Module):
     def sizes(self) -> tuple[int, int, int, int]:
         """Features of a line, a generator, a load and a storage unit."""
         gen = 4 + len(self.dispatch) + (2 if self.reads_action else 0)
-        return 9, gen, 3, len(self.of_storage) + int(self.reads_action)
+        return 9 + len(self.of_lines), gen, 3, len(self.of_storage) + int(self.reads_action)
 
     def forward(self, inputs: Tensor) -> _Elements:
         """Observations [batch, observation_size], each followed by its action where one is read."""
@@ -149,7 +152,7 @@ class Features(nn.Module):
             cooldown=cooldown.unsqueeze(1),
             second=second,
             in_service=in_service.unsqueeze(1),
-            time=part["t"],
+            time=torch.cat([part[name] for name in self.times]) if len(self.times) > 1 else part["t"],
         )
 
     def _topology(self, part: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
@@ -175,6 +178,7 @@ class Features(nn.Module):
             announced * part["duration_next_maintenance"],
             second[:n_line],
             second[n_line : 2 * n_line],
+            *(part[name] for name in self.of_lines),
         ]
         return torch.stack(columns, dim=1)
 
@@ -280,7 +284,7 @@ class GraphNetwork(nn.Module):
         self.output = output
         self.features = Features(spec, reads_action=output.reads_action)
         self.messages = Messages(request, self.features, width, max(len(request.layers), 1))
-        self.state = _Layer(request, 3 * width + 1, 4 * width)
+        self.state = _Layer(request, 3 * width + len(self.features.times), 4 * width)
         self.of_state = _Layer(request, 4 * width, output.per_state, last=True) if output.per_state else None
         self.chosen = _Chosen(request, width, self.features.n_topology) if self.features.n_topology else None
         self.scores = _Scores(request, width) if output.per_action else None

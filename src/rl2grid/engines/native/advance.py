@@ -15,7 +15,6 @@ from rl2grid.engines.native.environments import Environments, open_environments
 from rl2grid.engines.native.orders import Orders, order_one_change
 from rl2grid.engines.native.simulation import begin_simulation, copy_environment, finish_simulation
 from rl2grid.engines.native.step import begin_step, dispatch_or_lose, finish_step
-from rl2grid.handles import opener
 from rl2grid.mdp.accumulate import accrue, begin_episode, begin_transition, end_reset
 from rl2grid.mdp.actions import ActionKind
 from rl2grid.mdp.heuristics import (
@@ -34,13 +33,11 @@ from rl2grid.mdp.observations import (
     write_redispatch_observation,
     write_topology_observation,
 )
+from rl2grid.mdp.operator_features import open_security
 from rl2grid.mdp.rewards import default_components, paper_components, released_components
-from rl2grid.mdp.security import Security, is_secure
+from rl2grid.mdp.security import is_secure
 from rl2grid.mdp.state import GridState
 from rl2grid.memory import take_next
-
-open_security = opener(Security)
-"""From the address of a handle to what may be lost, in compiled code."""
 
 ALONE, IDLE, RECOVERY, RECONNECT, CAREFUL, CAREFUL_RECONNECT, SECURE, SECURE_RECONNECT = range(8)
 """Who plays between two decisions: nobody, or a heuristic (all but idle only reconnect on continuous tasks)."""
@@ -254,7 +251,7 @@ def write_observations(
         dispatch: whether the dispatch is observed.
         shift: float32 [feature], subtracted.
         scale: float32 [feature], divided by after that.
-        out: the observations.
+        out: the observations; what lies behind these features stays.
     """
     state = open_environments(address).state
     for i in rows:
@@ -264,5 +261,5 @@ def write_observations(
             write_topology_observation(state, i, out[i])
         else:
             write_redispatch_observation(state, i, out[i])
-        for entry in range(out.shape[1]):
+        for entry in range(shift.shape[0]):
             out[i, entry] = (out[i, entry] - shift[entry]) / scale[entry]

@@ -341,4 +341,5 @@ def _copy_episode(state: GridState, i: int, result: GridState, horizon: int) -> 
     result.terminated[0] = False
     result.truncated[0] = False
     result.attacked[0] = state.attacked[i]
+    result.attacked_at[0] = state.attacked_at[i]
     result.excused[0] = state.excused[i]
