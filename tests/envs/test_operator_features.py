@@ -162,3 +162,15 @@ def test_networks_and_graphs_are_told_what_they_belong_to() -> None:
 def test_what_is_no_group_is_refused_in_one_sentence(names: object) -> None:
     with pytest.raises(UsageError, match="give some of calendar, trips, attacks, security, separated by commas"):
         made("bus14-T0", operator_features=names)
+
+
+def test_forecasts_of_changed_topologies_are_told_alike_every_time() -> None:
+    """What compiled code is handed outlives the call: factors of a new topology read all of it."""
+    env = made(ATTACKED)
+    env.reset(seed=2)
+    actions = np.flatnonzero(env.action_masks())[:12]
+    first = [env.simulate(int(action)).observation for action in actions]
+    for action, before in zip(actions, first, strict=True):
+        np.testing.assert_array_equal(env.simulate(int(action)).observation, before)
+    where = env.observation_slices["loading_after_loss"]
+    assert len({tuple(observation[where]) for observation in first}) > 6

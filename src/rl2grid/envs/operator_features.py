@@ -13,6 +13,7 @@ from rl2grid.handles import Handle
 from rl2grid.mdp.features import OPERATOR_FEATURES, observation_size, operator_groups
 from rl2grid.mdp.operator_features import write_operator_features
 from rl2grid.mdp.security import Security, new_security
+from rl2grid.mdp.state import GridState
 from rl2grid.structures import with_own_workspace
 
 _EPOCH = datetime(1970, 1, 1)
@@ -50,31 +51,31 @@ class OperatorFeatures:
         """The episode of row ``i`` has begun at this time in its scenario."""
         self._began[i] = round((began - _EPOCH).total_seconds()) // _MINUTE
 
-    def write(self, address: int, rows: I64, out: F32) -> None:
+    def write(self, state: Handle[GridState], rows: I64, out: F32) -> None:
         """Write what is observed of ``rows``, scaled, to the same rows of ``out``, float32 [n, feature].
 
         Args:
-            address: of a handle to the state of all rows.
+            state: of all rows.
             rows: int64 [k].
             out: observations.
         """
-        self._write(address, rows, rows, rows, out)
+        self._write(state, rows, rows, rows, out)
         out[rows, self._first :] = (out[rows, self._first :] - self._shift) / self._scale
 
-    def write_raw(self, address: int, row: int, i: int, out: F32) -> None:
+    def write_raw(self, state: Handle[GridState], row: int, i: int, out: F32) -> None:
         """Write what is observed of one environment, in raw units, to ``out``, float32 [feature].
 
         Args:
-            address: of a handle to a state: of all rows, or a forecast.
+            state: of all rows, or a forecast.
             row: which of its rows.
             i: the environment.
             out: an observation.
         """
-        self._write(address, np.array([row]), np.array([i]), np.zeros(1, np.int64), out[np.newaxis])
+        self._write(state, np.array([row]), np.array([i]), np.zeros(1, np.int64), out[np.newaxis])
 
-    def _write(self, address: int, rows: I64, environments: I64, places: I64, out: F32) -> None:
+    def _write(self, state: Handle[GridState], rows: I64, environments: I64, places: I64, out: F32) -> None:
         write_operator_features(
-            address,
+            state.address,
             rows,
             self._groups,
             self._began[environments],

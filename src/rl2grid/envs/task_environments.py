@@ -214,7 +214,7 @@ class TaskEnvironments:
         observation = np.zeros(self._size, np.float32)
         self._write_observation(self.transitions.opened_result(result), 0, observation)
         if self._operator is not None:
-            self._operator.write_raw(Handle(result).address, 0, i, observation)
+            self._operator.write_raw(Handle(result), 0, i, observation)
         self._scale(observation)
         info = {**_start_info(plan), **episode_info(result, 0, self.constraint)}
         info["action_effect"] = effect or clipping(self.grid, result, 0, played)
@@ -438,19 +438,22 @@ class TaskEnvironments:
         """Write what is observed of row ``i``, in raw units."""
         self._write_observation(self.transitions.opened_state, i, out)
         if self._operator is not None:
-            self._operator.write_raw(self._state_address, i, i, out)
+            self._operator.write_raw(self._own_state(), i, i, out)
 
     def _scale(self, out: NDArray[np.float32]) -> None:
         shift, scale = self._normaliser
         out -= shift
         out /= scale
 
-    @property
-    def _state_address(self) -> int:
+    def _own_state(self) -> Handle[GridState]:
         """Where compiled code finds the state."""
         if self._state_handle.structure is not self.state:
             self._state_handle = Handle(self.state)
-        return self._state_handle.address
+        return self._state_handle
+
+    @property
+    def _state_address(self) -> int:
+        return self._own_state().address
 
     def _step_action(self, action: Any) -> StepAction:
         return step_action(self.task, self.grid, self._catalogue, action)
