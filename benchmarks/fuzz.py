@@ -1,9 +1,10 @@
 """Random steps without end: environments as users make them, and what must hold of every step.
 
 ``python benchmarks/fuzz.py [--steps 1000000] [--grids ...] [--kinds T R H]`` plays so many grid steps per grid and kind
-of action, a quarter with each heuristic, and writes ``benchmarks/results/fuzz.json``. Half of the environments play
-legal actions, the others whatever the space has; now and then an environment is saved, played on and brought back, and
-must play the same again. Whatever breaks a rule of :func:`broken_rules`, raises an exception or is another step after
+of action, a quarter without a heuristic and with each of three, and as many more with ``secure`` and operator features,
+and writes ``benchmarks/results/fuzz.json``. Half of the environments play legal actions, the others whatever the space
+has; now and then an environment is saved, played on and brought back, and must play the same again; forecasts asked for
+twice must be the same. Whatever breaks a rule of :func:`broken_rules`, raises an exception or is another step after
 coming back counts as a failure. Redispatching plays some of its steps with Grid2Op's own solver, which takes most of
 the time. A cell that is in the results with as many steps and the same seed is not played again.
 """
@@ -40,6 +41,8 @@ SETTINGS: tuple[dict[str, Any], ...] = (
     {"heuristic": "recovery", "split": "train", "constraint": "TLO", "gamma": 0.9},
     {"heuristic": "careful", "split": "train", "constraint": "LSI", "reward": "released"},
 )
+SECURE: dict[str, Any] = {"heuristic": "secure", "split": "train", "operator_features": "all"}
+"""Played beside :data:`SETTINGS`, as many steps as each of them."""
 SOLVER_OF_GRID2OP: dict[str, Any] = {"heuristic": "idle", "split": "train", "dispatch": "grid2op"}
 SHARE_OF_SOLVER = 0.01
 """Of the steps of a grid, played with :data:`SOLVER_OF_GRID2OP` behind the others."""
@@ -96,6 +99,7 @@ def settings_of(kind: str, steps: int) -> Iterator[tuple[str, dict[str, Any], in
     """Name, keywords and number of grid steps of the cells of a kind on one grid."""
     for setting in SETTINGS:
         yield setting["heuristic"] or "no heuristic", setting, -(-steps // len(SETTINGS))
+    yield "secure", SECURE, -(-steps // len(SETTINGS))
     if kind != "T":
         yield "Grid2Op's solver", SOLVER_OF_GRID2OP, round(steps * SHARE_OF_SOLVER)
 
@@ -225,6 +229,7 @@ def _bring_back(envs: Any, actions: Any, found: Found) -> None:
     first = observations.copy(), rewards.copy(), terminated.copy(), truncated.copy()
     for j, world in enumerate(worlds):
         envs.restore(j, world)
+    _foresee(envs, found)
     again = envs.step(actions)
     names = ("observations", "rewards", "terminated", "truncated")
     for name, before, after in zip(names, first, again[:4], strict=True):
@@ -233,6 +238,19 @@ def _bring_back(envs: Any, actions: Any, found: Found) -> None:
     for j, world in enumerate(worlds):
         envs.restore(j, world)
     found.brought_back += 1
+
+
+def _foresee(envs: Any, found: Found) -> None:
+    """Ask every environment twice for a forecast of a step, which must be the same and finite."""
+    space = envs.single_action_space
+    space.seed(found.decisions)
+    action = space.sample()
+    forecasts = (envs.call("simulate", action) for _ in range(2))
+    for one, other in zip(*forecasts, strict=True):
+        if not np.isfinite(one.observation).all():
+            found.fail("a forecast is not finite")
+        if not np.array_equal(one.observation, other.observation) or one.reward != other.reward:
+            found.fail("two forecasts of the same step differ")
 
 
 def main() -> int:
