@@ -61,8 +61,8 @@ __all__ = ["CONVERGED", "DISCONNECTED", "DIVERGED", "RowFlows", "RowSolver", "fl
 _BASE: Any = np.int64(0)
 _ALONE: Any = np.int64(1)
 """Rows of a solver's flow: where lanes start; one flow after another, solved cold."""
-_TRUSTED_STEPS = 5
-"""Newton steps of a cold flow that leave no doubt about its neighbours, as in :mod:`rl2grid.powerflow.newton`."""
+_SPARE_STEPS = 3
+"""Newton steps that the cold recipe leaves unused on a row near which it can be trusted to find solutions too."""
 
 
 class Injections(NamedTuple):
@@ -400,7 +400,7 @@ def _find_base(sweep: Sweep, injections: Injections) -> bool:
         )  # fmt: skip
         if not flow.connected[_BASE] or not flow.known[_BASE]:
             return False
-        if status == CONVERGED and flow.anchor_steps[_BASE] <= _TRUSTED_STEPS:
+        if status == CONVERGED and flow.anchor_steps[_BASE] <= sweep.network.max_iterations[0] - _SPARE_STEPS:
             return True
     return False
 
