@@ -22,7 +22,7 @@ from rl2grid.powerflow.ac import (
     write_currents,
     write_flow,
 )
-from rl2grid.powerflow.bridges import find_bridges
+from rl2grid.powerflow.bridges import find_bridges, find_cuts
 from rl2grid.powerflow.model import load_network
 from rl2grid.powerflow.rows import RowFlows, RowSolver
 from rl2grid.scenarios.library import list_scenarios, load_scenario
@@ -130,7 +130,7 @@ def test_rows_without_solution_have_the_cold_recipes_verdict(grid_id: str) -> No
     found, cold = rows.flows(grid_id, *given), ColdFlows(grid, topo_vect)
     statuses = [cold.check(found, k, list(row)) for k, row in enumerate(zip(*given, strict=True))]
     assert {CONVERGED, DIVERGED} == set(statuses)
-    assert (found.cold >= (found.status != CONVERGED)).all()
+    assert found.cold[found.status != CONVERGED].all()
 
 
 @pytest.mark.parametrize("grid_id", GRID_IDS)
@@ -144,7 +144,9 @@ def test_outages_equal_cold_flows(grid_id: str, divided: bool) -> None:
     statuses = [cold.check(found, line, row, line) for line in range(grid.n_line)]
     bridges = find_bridges(cold.network, topo_vect)
     assert DISCONNECTED in statuses
-    assert (found.cold >= bridges).all()
+    cuts = find_cuts(cold.network, topo_vect)
+    assert cuts.tolist() == [status == DISCONNECTED for status in statuses]
+    assert (found.cold[bridges] == ~cuts[bridges]).all()
     assert found.cold[~bridges].mean() < 0.3
 
 

@@ -43,6 +43,31 @@ def find_bridges(network: Network, topo_vect: I32) -> Flags:
     return bridge
 
 
+def find_cuts(network: Network, topo_vect: I32) -> Flags:
+    """Which bridges hold elements on both sides, bool [line]: without such a line there is no flow.
+
+    The bus that any other bridge leaves behind is empty, and no bus then.
+
+    Args:
+        network: electrical model of the grid.
+        topo_vect: int32 [topo] busbar (1 or 2) of each element, -1 when disconnected.
+    """
+    n_sub = len(network.nominal_voltage)
+    ends = network.line_or_sub, network.line_ex_sub
+    places = network.line_or_position, network.line_ex_position
+    subs = np.concatenate((*ends, network.gen_sub, network.load_sub, network.storage_sub))
+    busbars = topo_vect[
+        np.concatenate((*places, network.gen_position, network.load_position, network.storage_position))
+    ]
+    buses = np.concatenate(((subs + n_sub * (busbars - 1))[busbars > 0], network.shunt_sub))
+    held = np.bincount(buses, minlength=2 * n_sub)
+    alone = [
+        held[sub + n_sub * (np.maximum(topo_vect[place], 1) - 1)] == 1 for sub, place in zip(ends, places, strict=True)
+    ]
+    cuts: Flags = find_bridges(network, topo_vect) & ~(alone[0] | alone[1])
+    return cuts
+
+
 def _ways(network: Network, topo_vect: I32) -> dict[int, list[tuple[int, int]]]:
     """Closed lines at each bus, and the bus at the other end."""
     n_sub = len(network.nominal_voltage)

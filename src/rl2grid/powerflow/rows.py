@@ -29,7 +29,7 @@ from rl2grid.powerflow.ac import (
     write_currents,
     write_flow,
 )
-from rl2grid.powerflow.bridges import find_bridges
+from rl2grid.powerflow.bridges import find_bridges, find_cuts
 from rl2grid.powerflow.factors import factorise
 from rl2grid.powerflow.flow_state import ABSENT, Equations, Factors
 from rl2grid.powerflow.lane_factors import LaneFactors, new_lane_factors
@@ -97,6 +97,7 @@ class Topology(NamedTuple):
 
     topo_vect: Annotated[I32, constant("topo", "busbar of each element, -1 when disconnected")]
     bridge: Annotated[Flags, constant("line", "the line is the only way between its ends")]
+    cut: Annotated[Flags, constant("line", "it is, with elements on both sides")]
 
 
 class Scratch(NamedTuple):
@@ -144,7 +145,7 @@ class RowSolver:
         n_value, n_unknown = flow.panel.shape[1], flow.node_of_unknown.shape[1]
         sweep = Sweep(
             self.network,
-            Topology(topology, find_bridges(self.network, topology)),
+            Topology(topology, find_bridges(self.network, topology), find_cuts(self.network, topology)),
             flow,
             new_row_lanes(sizes["bus"], grid.n_line),
             new_lane_factors(n_value, n_unknown),
@@ -372,20 +373,33 @@ def solve_cases(address: int, injections: Injections, cases: Cases, found: RowFl
     else:
         fill_jacobian(equations, factors)
         factorise(factors)
-    for begin in range(0, n, WIDTH):
+    case = 0
+    while case < n:
         begin_lanes(equations, lanes)
         for lane in range(WIDTH):
             lanes.state[lane] = EMPTY
-            if begin + lane < n:
-                _place_case(sweep, equations, injections, cases, begin + lane, lane)
+            while case < n and _is_cut(sweep, cases, case):
+                _write_nothing(found, case, DISCONNECTED)
+                found.cold[case] = False
+                case += 1
+            if case < n:
+                _place_case(sweep, equations, injections, cases, case, lane)
+                case += 1
         if with_outages:
             solve_outages(equations, factors, sweep.lane_factors, lanes, network.tolerance[0])
         else:
             solve_rows(equations, factors, sweep.lane_factors, lanes, network.tolerance[0])
         write_line_flows(network, flow, _BASE, lanes)
         for lane in range(WIDTH):
-            if begin + lane < n:
-                _finish_case(sweep, injections, cases, found, begin + lane, lane)
+            if lanes.state[lane] != EMPTY:
+                _finish_case(sweep, injections, cases, found, lane)
+
+
+@borrowing_jit
+def _is_cut(sweep: Sweep, cases: Cases, case: Index) -> bool:
+    """Whether no flow is possible because the lost line cuts off some element."""
+    line = cases.line[case]
+    return bool(line != NO_LINE and sweep.topology.cut[line])
 
 
 @borrowing_jit
@@ -412,6 +426,7 @@ def _place_case(
     """Let a lane solve a flow, or fail if that is not for lanes."""
     network, flow, lanes = sweep.network, sweep.flow, sweep.lanes
     row, line = cases.row[case], cases.line[case]
+    lanes.case[lane] = case
     lanes.state[lane] = RUNNING
     lanes.line[lane] = NO_LINE
     if line != NO_LINE and flow.line_or_node[_BASE, line] != ABSENT:
@@ -454,9 +469,10 @@ def _write_injections(sweep: Sweep, injections: Injections, row: Index, lane: In
 
 
 @borrowing_jit
-def _finish_case(sweep: Sweep, injections: Injections, cases: Cases, found: RowFlows, case: Index, lane: Index) -> None:
+def _finish_case(sweep: Sweep, injections: Injections, cases: Cases, found: RowFlows, lane: Index) -> None:
     """Write what a lane has found, or ask the cold recipe."""
     lanes = sweep.lanes
+    case = lanes.case[lane]
     if lanes.line[lane] != NO_LINE:
         put_line_back(sweep.flow, _BASE, lanes, lane)
     if lanes.state[lane] != DONE:
@@ -483,17 +499,24 @@ def _solve_alone(sweep: Sweep, injections: Injections, cases: Cases, found: RowF
         network, flow, _ALONE, topo_vect, injections.gen_p[row], injections.gen_v[row], injections.load_p[row],
         injections.load_q[row], injections.storage_p[row],
     )  # fmt: skip
-    found.status[case] = status
     found.cold[case] = True
-    found.slack_p[case] = 0.0
     if status != CONVERGED:
-        for line in range(found.a_or.shape[1]):
-            found.a_or[case, line] = 0.0
-            found.p_or[case, line] = 0.0
+        _write_nothing(found, case, status)
         return
+    found.status[case] = CONVERGED
     write_currents(network, flow, _ALONE, found.a_or[case])
     write_flow(
         network, flow, _ALONE, found.p_or[case], scratch.gen_p, scratch.gen_theta, scratch.load_theta,
         scratch.storage_theta,
     )  # fmt: skip
     found.slack_p[case] = scratch.gen_p[network.slack_gen[0]]
+
+
+@borrowing_jit
+def _write_nothing(found: RowFlows, case: Index, status: int) -> None:
+    """Write that there is no flow."""
+    found.status[case] = status
+    found.slack_p[case] = 0.0
+    for line in range(found.a_or.shape[1]):
+        found.a_or[case, line] = 0.0
+        found.p_or[case, line] = 0.0
