@@ -311,7 +311,8 @@ def _read_topology(grid: Grid, topo_vect: ArrayLike | None) -> I32:
 def _read_rows(name: str, value: Any, dtype: Any, n: int | None, width: int) -> Any:
     """An array of rows; ``n`` None: of any number of them."""
     try:
-        array = np.ascontiguousarray(value, dtype)
+        # A copy of what is read-only, for which everything would be compiled once more.
+        array = np.require(value, dtype, ("C", "W"))
     except (TypeError, ValueError):
         raise UsageError(f"{name} must be an array of numbers, [row, {width}].") from None
     if array.ndim != 2 or array.shape[1] != width or n not in (None, len(array)):
