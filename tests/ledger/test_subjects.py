@@ -140,3 +140,5 @@ def test_a_length_is_part_of_a_configuration_where_it_was_given():
     """Configurations that were entered before there were lengths are called as they were."""
     assert subjects._frozen({"heuristic": None, "episode_length": None}) == {"heuristic": None}
     assert subjects._frozen({"episode_length": 2016}) == {"episode_length": 2016}
+    assert subjects._frozen({"operator_features": None}) == {}
+    assert subjects._frozen({"operator_features": "all"}) == {"operator_features": "all"}

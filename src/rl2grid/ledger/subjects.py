@@ -150,9 +150,13 @@ def _test_of(task: Task, months: int | None) -> dict[str, Any]:
     return {"split_version": split_version(task.grid_id, TEST), "months": number}
 
 
+_LATER = ("episode_length", "operator_features")
+"""Keywords that came after the first results."""
+
+
 def _frozen(keywords: Mapping[str, Any]) -> dict[str, Any]:
-    """The keywords of a training; ``episode_length`` only where it was given: others are called as they were before."""
-    return {name: value for name, value in keywords.items() if name != "episode_length" or value is not None}
+    """The keywords of a training; later ones only where they were given: others are called as they were before."""
+    return {name: value for name, value in keywords.items() if name not in _LATER or value is not None}
 
 
 def _learned_from(identity: Mapping[str, Any]) -> dict[str, Any]:

@@ -79,9 +79,11 @@ class HashedTest:
 
     @property
     def player(self) -> str:
-        """The agent, and of how many of its best actions the what-if chose."""
+        """The agent, what it observes beside the paper's features, and of how many actions the what-if chose."""
+        features = self.configuration.get("env_keywords", {}).get("operator_features")
         top_k = self.configuration.get("top_k")
-        return self.agent if top_k is None else f"{self.agent}, best of {top_k}"
+        observing = "" if features is None else f", observing {features}"
+        return f"{self.agent}{observing}" + ("" if top_k is None else f", best of {top_k}")
 
     @property
     def label(self) -> str:
