@@ -201,6 +201,8 @@ def _play(
         legal = envs.action_masks()[np.arange(NUM_ENVS), actions] if discrete else np.zeros(NUM_ENVS, np.bool_)
         if found.decisions // NUM_ENVS % EVERY == 0:
             _bring_back(envs, actions, found)
+            if not infos["over"].any():  # there is no forecast of an episode that ended inside reset
+                _foresee(envs, found)
         outcome = envs.step(actions)
         for words in broken_rules(envs, outcome, sums, legal, reward):
             found.fail(f"{words} (decision {found.decisions // NUM_ENVS})")
@@ -229,7 +231,6 @@ def _bring_back(envs: Any, actions: Any, found: Found) -> None:
     first = observations.copy(), rewards.copy(), terminated.copy(), truncated.copy()
     for j, world in enumerate(worlds):
         envs.restore(j, world)
-    _foresee(envs, found)
     again = envs.step(actions)
     names = ("observations", "rewards", "terminated", "truncated")
     for name, before, after in zip(names, first, again[:4], strict=True):
