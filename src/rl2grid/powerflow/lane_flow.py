@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, NamedTuple
+from typing import Annotated, NamedTuple, Protocol
 
 import numpy as np
 
@@ -47,6 +47,21 @@ class LaneFlow(NamedTuple):
     action: Annotated[I32, workspace("lane", "entry of the request that a lane works for")]
     admittance: Annotated[F64, workspace("entry 2", "of the lines that no lane treats in its own way", "per unit")]
     injection: Annotated[F64, workspace("bus 2", "by node; active and reactive", "per unit")]
+
+
+class Stepped(Protocol):
+    """Flows side by side, as the functions below need them: a :class:`LaneFlow`, or one of another kind."""
+
+    @property
+    def voltage(self) -> Lanes: ...
+    @property
+    def step(self) -> Lanes: ...
+    @property
+    def active(self) -> Lanes: ...
+    @property
+    def distance(self) -> Lanes: ...
+    @property
+    def state(self) -> I8: ...
 
 
 def new_lane_flow(n_bus: int, n_line: int) -> LaneFlow:
@@ -166,7 +181,7 @@ def turn(voltage: Lanes, row: Index, angle, growth) -> None:  # type: ignore[no-
 
 
 @borrowing_jit
-def step_lanes(lane_flow: LaneFlow, equations: Equations) -> None:
+def step_lanes(lane_flow: Stepped, equations: Equations) -> None:
     """Subtract the Newton step from the angles and magnitudes of lanes under way."""
     first_unknown = equations.first_unknown
     towards = -load(lane_flow.active, 0)
@@ -187,7 +202,7 @@ def squared_change(e, f, e_before, f_before):  # type: ignore[no-untyped-def]
 
 
 @borrowing_jit
-def measure_distance(lane_flow: LaneFlow, equations: Equations) -> None:
+def measure_distance(lane_flow: Stepped, equations: Equations) -> None:
     """Write how far each lane is from the base case."""
     farthest = splat(0.0)
     for node in range(equations.n_free + 1):
@@ -202,7 +217,7 @@ def measure_distance(lane_flow: LaneFlow, equations: Equations) -> None:
 
 
 @borrowing_jit
-def dismiss_distant_lanes(lane_flow: LaneFlow) -> None:
+def dismiss_distant_lanes(lane_flow: Stepped) -> None:
     """Let lanes fail whose solution the cold recipe has to confirm."""
     for lane in range(WIDTH):
         if lane_flow.state[lane] == DONE and not lane_flow.distance[0, lane] < _FARTHEST:

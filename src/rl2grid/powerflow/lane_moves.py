@@ -532,7 +532,7 @@ def _invert(matrix: Lanes) -> None:
 def _solve_bordered(factors: Factors, paths: Paths, lane_flow: LaneFlow, site: Site) -> None:
     """Turn the mismatches of grid and busbars into Newton steps."""
     step, n_lines, n_free = lane_flow.step, site.counts[N_LINES], factors.n_free
-    solve_forward(factors, step)
+    solve_forward(factors, factors.panel, step)
     p1 = load(site.residual, 0)
     q1 = load(site.residual, 1)
     p2 = load(site.residual, 2)
@@ -575,7 +575,7 @@ def _solve_bordered(factors: Factors, paths: Paths, lane_flow: LaneFlow, site: S
             value = fma(-at(paths.right, 2 * (base + place)), active, value)
             value = fma(-at(paths.right, 2 * (base + place) + 1), reactive, value)
             store(step, unknown, value)
-    solve_backward(factors, step)
+    solve_backward(factors, factors.panel, step)
 
 
 @borrowing_jit

@@ -153,9 +153,9 @@ def solve_switches(
     store(lane_flow.norm, 0, root(square_step(lane_flow, equations)))
     n_steps = 0
     while judge_lanes(lane_flow, n_steps, network.base_power[0]):
-        solve_forward(factors, lane_flow.step)
+        solve_forward(factors, factors.panel, lane_flow.step)
         _correct(equations, paths, lane_flow, switches)
-        solve_backward(factors, lane_flow.step)
+        solve_backward(factors, factors.panel, lane_flow.step)
         step_lanes(lane_flow, equations)
         n_steps += 1
         if any_lane_runs(lane_flow):

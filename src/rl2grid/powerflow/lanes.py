@@ -17,7 +17,7 @@ from numba import types
 from numba.core import cgutils
 from numba.core.datamodel import models
 from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
-from numba.extending import intrinsic, lower_builtin, register_model
+from numba.extending import intrinsic, lower_builtin, overload, register_model
 from numpy.typing import NDArray
 
 Lanes = NDArray[np.float64]
@@ -125,6 +125,25 @@ fma = _call("fma", 3)
 larger = _call("maxnum", 2)
 magnitude = _call("fabs", 1)
 root = _call("sqrt", 1)
+
+
+def lanes_at(axes: int) -> Any:
+    """What reads entry or row ``k`` of an array into every lane, whether all lanes share it or each has its own.
+
+    Args:
+        axes: of an array that lanes share (:func:`at`); of lanes it has one more (:func:`load`).
+    """
+
+    def read(array: Any, k: Any) -> Any:
+        """Entry or row ``k``."""
+
+    def choose(array, k):  # type: ignore[no-untyped-def]  # Numba compares signatures, annotations included
+        if array.ndim == axes:
+            return lambda array, k: at(array, k)
+        return lambda array, k: load(array, k)
+
+    overload(read)(choose)
+    return read
 
 
 def _define(symbol: Any, name: str, n_arguments: int) -> None:

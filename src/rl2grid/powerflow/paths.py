@@ -14,8 +14,11 @@ from rl2grid.arrays import F64, I32, U32, Index
 from rl2grid.compile import borrowing_jit
 from rl2grid.powerflow.factors import ONE, THREE, TWO
 from rl2grid.powerflow.flow_state import Factors
-from rl2grid.powerflow.lanes import Lanes, at, fma, load, store
+from rl2grid.powerflow.lanes import Lanes, fma, lanes_at, load, store
 from rl2grid.structures import allocate, workspace
+
+_panel_at = lanes_at(1)
+"""A value of factors that all lanes share, or of each lane's own."""
 
 
 class Paths(NamedTuple):
@@ -117,33 +120,39 @@ def write_path_product(paths: Paths, a: Index, b: Index, product: F64) -> None:
 
 
 @borrowing_jit
-def solve_forward(factors: Factors, right_hand_sides: Lanes) -> None:
-    """Multiply ``right_hand_sides``, lanes [unknown], by the inverse of L."""
-    first_unknown, column, panel = factors.first_unknown, factors.column, factors.panel
+def solve_forward(factors: Factors, panel: F64, right_hand_sides: Lanes) -> None:
+    """Multiply ``right_hand_sides``, lanes [unknown], by the inverse of L.
+
+    Args:
+        factors: their pattern.
+        panel: their values, ``factors.panel`` or lanes of as many.
+        right_hand_sides: turned into the products.
+    """
+    first_unknown, column = factors.first_unknown, factors.column
     for node in range(factors.n_free):
         unknown = first_unknown[node]
         place = np.uint64(factors.first_panel[node])
         x = load(right_hand_sides, unknown)
         if first_unknown[node + 1] - unknown == 1:
             for q in range(factors.first_column[node], factors.own_column[node]):
-                x = fma(-at(panel, place), load(right_hand_sides, column[q]), x)
+                x = fma(-_panel_at(panel, place), load(right_hand_sides, column[q]), x)
                 place += ONE
             store(right_hand_sides, unknown, x)
             continue
         y = load(right_hand_sides, unknown + ONE)
         for q in range(factors.first_column[node], factors.own_column[node]):
             known = load(right_hand_sides, column[q])
-            x = fma(-at(panel, place), known, x)
-            y = fma(-at(panel, place + ONE), known, y)
+            x = fma(-_panel_at(panel, place), known, x)
+            y = fma(-_panel_at(panel, place + ONE), known, y)
             place += TWO
         store(right_hand_sides, unknown, x)
         store(right_hand_sides, unknown + ONE, y)
 
 
 @borrowing_jit
-def solve_backward(factors: Factors, right_hand_sides: Lanes) -> None:
-    """Multiply ``right_hand_sides``, lanes [unknown], by the inverse of U."""
-    first_unknown, column, panel = factors.first_unknown, factors.column, factors.panel
+def solve_backward(factors: Factors, panel: F64, right_hand_sides: Lanes) -> None:
+    """Multiply ``right_hand_sides``, lanes [unknown], by the inverse of U; arguments as of :func:`solve_forward`."""
+    first_unknown, column = factors.first_unknown, factors.column
     for node in range(factors.n_free - 1, -1, -1):
         unknown = first_unknown[node]
         own = np.uint64(factors.own_panel[node])
@@ -152,15 +161,15 @@ def solve_backward(factors: Factors, right_hand_sides: Lanes) -> None:
         if first_unknown[node + 1] - unknown == 1:
             for q in range(factors.own_column[node] + ONE, factors.first_column[node + 1]):
                 place += ONE
-                x = fma(-at(panel, place), load(right_hand_sides, column[q]), x)
-            store(right_hand_sides, unknown, x * at(panel, own))
+                x = fma(-_panel_at(panel, place), load(right_hand_sides, column[q]), x)
+            store(right_hand_sides, unknown, x * _panel_at(panel, own))
             continue
         y = load(right_hand_sides, unknown + ONE)
         place += TWO
         for q in range(factors.own_column[node] + TWO, factors.first_column[node + 1]):
             place += TWO
             known = load(right_hand_sides, column[q])
-            x = fma(-at(panel, place), known, x)
-            y = fma(-at(panel, place + ONE), known, y)
-        store(right_hand_sides, unknown, fma(y, at(panel, own + TWO), x * at(panel, own)))
-        store(right_hand_sides, unknown + ONE, fma(y, at(panel, own + THREE), x * at(panel, own + ONE)))
+            x = fma(-_panel_at(panel, place), known, x)
+            y = fma(-_panel_at(panel, place + ONE), known, y)
+        store(right_hand_sides, unknown, fma(y, _panel_at(panel, own + TWO), x * _panel_at(panel, own)))
+        store(right_hand_sides, unknown + ONE, fma(y, _panel_at(panel, own + THREE), x * _panel_at(panel, own + ONE)))

@@ -6,21 +6,18 @@ import math
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from numba.extending import overload
 
 from rl2grid.arrays import F32, F64, I8, I32, U16, Index
 from rl2grid.compile import borrowing_jit
 from rl2grid.powerflow.factors import ONE, THREE, TWO
 from rl2grid.powerflow.flow_state import ABSENT, Equations, Factors, FlowState
-from rl2grid.powerflow.lane_factors import LaneFactors, factorise_lanes, solve_lanes
-from rl2grid.powerflow.lane_flow import squared_change, turn
-from rl2grid.powerflow.lanes import WIDTH, Lanes, at, fma, larger, load, magnitude, root, splat, store
+from rl2grid.powerflow.lane_factors import LaneFactors, factorise_lanes
+from rl2grid.powerflow.lane_flow import DONE, FAILED, RUNNING, dismiss_distant_lanes, measure_distance, step_lanes
+from rl2grid.powerflow.lanes import WIDTH, Lanes, at, fma, lanes_at, larger, load, magnitude, root, splat, store
 from rl2grid.powerflow.model import Network
 from rl2grid.powerflow.paths import solve_backward, solve_forward
 from rl2grid.structures import allocate, workspace
 
-RUNNING, DONE, FAILED, EMPTY = range(4)
-"""States of a lane."""
 NO_LINE = -1
 _SHARED_STEPS = 2
 """Steps of a row with the factors of the base case before its own are made; none, one, three and four were no faster on
@@ -31,10 +28,10 @@ longer."""
 _MAX_STEPS = 12
 _SLOWEST = 0.5
 """From the third step on, a lane that keeps more of its mismatch than this is handed to the cold recipe."""
-_FARTHEST = 0.5
-"""So far from the base case, per unit, the cold recipe has to confirm a solution."""
 _SETPOINT_TOLERANCE = 1e-7
 """Per unit, as in :mod:`rl2grid.powerflow.ac`."""
+_admittance_at = lanes_at(2)
+"""A number of the admittance matrix that all lanes share, or of each lane's own."""
 
 
 class RowLanes(NamedTuple):
@@ -47,7 +44,7 @@ class RowLanes(NamedTuple):
     active: Annotated[Lanes, workspace("1 lane", "1.0 in lanes under way")]
     mismatch: Annotated[Lanes, workspace("1 lane", "largest; not a number if any is not finite", "per unit")]
     mismatch_before: Annotated[Lanes, workspace("1 lane", "a step ago", "per unit")]
-    distance: Annotated[Lanes, workspace("1 lane", "largest change of a voltage since the base case, squared")]
+    distance: Annotated[Lanes, workspace("1 lane", "largest change of a voltage since the base case", "per unit")]
     current: Annotated[Lanes, workspace("line lane", "at the origin", "kA")]
     power: Annotated[Lanes, workspace("line lane", "active, entering at the origin", "MW")]
     slack_p: Annotated[Lanes, workspace("1 lane", "production of the slack generator", "per unit")]
@@ -62,17 +59,6 @@ def new_row_lanes(n_bus: int, n_line: int) -> RowLanes:
     """Blank lanes for a grid."""
     sizes = {"bus": n_bus, "unknown": 2 * n_bus, "entry": n_bus + 2 * n_line, "line": n_line, "lane": WIDTH}
     return allocate(RowLanes, sizes)
-
-
-def _admittance_at(admittance, k):  # type: ignore[no-untyped-def]
-    """Number ``k`` of the admittance matrix that all lanes share, [entry 2], or of each lane's own, [entry 2 lane]."""
-
-
-@overload(_admittance_at)  # type: ignore[untyped-decorator]
-def _choose_admittance(admittance, k):  # type: ignore[no-untyped-def]
-    if admittance.ndim == 2:
-        return lambda admittance, k: at(admittance, k)
-    return lambda admittance, k: load(admittance, k)
 
 
 @borrowing_jit
@@ -163,17 +149,19 @@ def _solve(
     n_steps = 0
     while _judge(lanes, n_steps, tolerance):
         if n_steps < n_shared:
-            solve_forward(factors, lanes.step)
-            solve_backward(factors, lanes.step)
+            solve_forward(factors, factors.panel, lanes.step)
+            solve_backward(factors, factors.panel, lanes.step)
         else:
             if n_steps < n_shared + n_own:
                 _fill_jacobian(equations, factors, lane_factors.panel, lanes, admittance)
                 factorise_lanes(factors, lane_factors)
-            solve_lanes(factors, lane_factors.panel, lanes.step)
-        _apply_step(equations, lanes)
+            solve_forward(factors, lane_factors.panel, lanes.step)
+            solve_backward(factors, lane_factors.panel, lanes.step)
+        step_lanes(lanes, equations)
         _measure(equations, lanes, admittance)
         n_steps += 1
-    _dismiss_distant_lanes(equations, lanes)
+    measure_distance(lanes, equations)
+    dismiss_distant_lanes(lanes)
     _write_slack(equations, lanes, admittance)
 
 
@@ -187,7 +175,7 @@ def _measure(equations: Equations, lanes: RowLanes, admittance: F64) -> None:
         real = imaginary = splat(0.0)
         for entry in range(first[node], first[node + 1]):
             other = TWO * np.uint64(column[entry])
-            g, b = _admittance_at(admittance, 2 * entry), _admittance_at(admittance, 2 * entry + 1)  # type: ignore[no-untyped-call]
+            g, b = _admittance_at(admittance, 2 * entry), _admittance_at(admittance, 2 * entry + 1)
             e, f = load(voltage, other), load(voltage, other + ONE)
             real = fma(-b, f, fma(g, e, real))
             imaginary = fma(b, e, fma(g, f, imaginary))
@@ -225,20 +213,6 @@ def _judge(lanes: RowLanes, n_steps: int, tolerance: float) -> bool:
 
 
 @borrowing_jit
-def _apply_step(equations: Equations, lanes: RowLanes) -> None:
-    """Subtract the Newton step from the angles and magnitudes of lanes under way."""
-    first_unknown, step = equations.first_unknown, lanes.step
-    towards = -load(lanes.active, 0)
-    for node in range(equations.n_free):
-        unknown = first_unknown[node]
-        angle = load(step, unknown) * towards
-        growth = splat(0.0)
-        if first_unknown[node + 1] - unknown == 2:
-            growth = load(step, unknown + ONE) * towards
-        turn(lanes.voltage, 2 * node, angle, growth)
-
-
-@borrowing_jit
 def _fill_jacobian(equations: Equations, factors: Factors, panel: Lanes, lanes: RowLanes, admittance: F64) -> None:
     """Derivatives of the power at the present voltages of every lane."""
     first, column, block = equations.admittance_first, equations.admittance_node, equations.admittance_panel
@@ -252,7 +226,7 @@ def _fill_jacobian(equations: Equations, factors: Factors, panel: Lanes, lanes: 
         active = reactive = splat(0.0)
         for entry in range(first[node], first[node + 1]):
             other = np.uint64(column[entry])
-            g, b = _admittance_at(admittance, 2 * entry), _admittance_at(admittance, 2 * entry + 1)  # type: ignore[no-untyped-call]
+            g, b = _admittance_at(admittance, 2 * entry), _admittance_at(admittance, 2 * entry + 1)
             e2, f2 = load(voltage, TWO * other), load(voltage, TWO * other + ONE)
             real, imaginary = fma(g, e2, -(b * f2)), fma(g, f2, b * e2)
             along, across = fma(e, real, f * imaginary), fma(f, real, -(e * imaginary))
@@ -273,22 +247,6 @@ def _fill_jacobian(equations: Equations, factors: Factors, panel: Lanes, lanes: 
             store(panel, own + ONE, load(panel, own + ONE) + active)
             store(panel, own + TWO, load(panel, own + TWO) + active)
             store(panel, own + THREE, load(panel, own + THREE) + reactive)
-
-
-@borrowing_jit
-def _dismiss_distant_lanes(equations: Equations, lanes: RowLanes) -> None:
-    """Let lanes fail whose solution the cold recipe has to confirm."""
-    farthest = splat(0.0)
-    for k in range(equations.n_free + 1):
-        change = squared_change(  # type: ignore[no-untyped-call]
-            load(lanes.voltage, 2 * k), load(lanes.voltage, 2 * k + 1), at(equations.voltage, 2 * k),
-            at(equations.voltage, 2 * k + 1),
-        )  # fmt: skip
-        farthest = larger(farthest, change)
-    store(lanes.distance, 0, farthest)
-    for lane in range(WIDTH):
-        if lanes.state[lane] == DONE and not lanes.distance[0, lane] < _FARTHEST * _FARTHEST:
-            lanes.state[lane] = FAILED
 
 
 @borrowing_jit
@@ -322,7 +280,7 @@ def _write_slack(equations: Equations, lanes: RowLanes, admittance: F64) -> None
     real = imaginary = splat(0.0)
     for entry in range(first[slack], first[slack + 1]):
         other = TWO * np.uint64(column[entry])
-        g, b = _admittance_at(admittance, 2 * entry), _admittance_at(admittance, 2 * entry + 1)  # type: ignore[no-untyped-call]
+        g, b = _admittance_at(admittance, 2 * entry), _admittance_at(admittance, 2 * entry + 1)
         e, f = load(lanes.voltage, other), load(lanes.voltage, other + ONE)
         real = fma(-b, f, fma(g, e, real))
         imaginary = fma(b, e, fma(g, f, imaginary))

@@ -33,15 +33,12 @@ from rl2grid.powerflow.bridges import find_bridges, find_cuts
 from rl2grid.powerflow.factors import factorise
 from rl2grid.powerflow.flow_state import ABSENT, Equations, Factors
 from rl2grid.powerflow.lane_factors import LaneFactors, new_lane_factors
+from rl2grid.powerflow.lane_flow import DONE, EMPTY, FAILED, RUNNING
 from rl2grid.powerflow.lanes import WIDTH
 from rl2grid.powerflow.model import Network, load_network
 from rl2grid.powerflow.newton import fill_jacobian
 from rl2grid.powerflow.row_lanes import (
-    DONE,
-    EMPTY,
-    FAILED,
     NO_LINE,
-    RUNNING,
     RowLanes,
     begin_lanes,
     copy_line_flows,
