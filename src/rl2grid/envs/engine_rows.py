@@ -19,6 +19,7 @@ from rl2grid.envs.rows import Batch
 from rl2grid.envs.task_environments import StreamPosition, TaskEnvironments
 from rl2grid.envs.tasks import Task
 from rl2grid.errors import one_of
+from rl2grid.handles import Handle
 from rl2grid.mdp import reports
 from rl2grid.mdp.action_masks import write_action_masks
 from rl2grid.mdp.reports import Report, blank_report, write_outcomes, write_report
@@ -40,6 +41,7 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
         super().__init__(task, options, n)
         self._n = n
         self._rows = np.arange(n)
+        self._state_handle = Handle(self.state)
         self._scenarios = np.full(n, "", object)
         self._hashes = [] if self._hash is None else [np.full(n, self._hash, object)]
         self._episodes = np.zeros((reports.EARLIER_STEPS + 1, n), np.int64)
@@ -188,6 +190,13 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
         """Say what is wrong with the first wrong action."""
         for action in one_by_one(self.task, actions):
             self._step_action(action)
+
+    @property
+    def _state_address(self) -> int:
+        """Where compiled code finds the state."""
+        if self._state_handle.structure is not self.state:
+            self._state_handle = Handle(self.state)
+        return self._state_handle.address
 
     def _endings(self, rows: I64, effects: NDArray[np.object_]) -> dict[str, Any]:
         """Infos of ``rows``, whose episodes have ended: their last observations and infos, masked."""

@@ -54,11 +54,13 @@ from numpy.typing import NDArray
 from rl2grid.envs.tasks import Task
 from rl2grid.errors import UsageError
 from rl2grid.mdp.features import (
+    CALENDAR,
     OPERATOR_FEATURES,
     changes_topology,
     feature_slices,
     injects,
     operator_groups,
+    operator_line_features,
     physical_scale,
 )
 
@@ -102,15 +104,13 @@ class GraphBuilder:
         self._grid, self._kind = grid, task.kind
         self._slices = feature_slices(grid, task.kind, operator_features)
         shift, scale = physical_scale(grid, task.kind, operator_features)
-        groups = operator_groups(operator_features)
-        times = OPERATOR_FEATURES["calendar"] if "calendar" in groups else ()
-        of_lines = [name for group in groups if group != "calendar" for name in OPERATOR_FEATURES[group]]
+        times = OPERATOR_FEATURES[CALENDAR] if CALENDAR in operator_groups(operator_features) else ()
         self._physical = normalize == "physical"
         self._shift, self._scale = (shift, scale) if self._physical else (np.zeros_like(shift), np.ones_like(scale))
         self.node_features: tuple[str, ...] = _NODE_FEATURES[task.kind]
         """Names of the columns of ``nodes``."""
         *of_edges, forward = _EDGE_FEATURES[task.kind]
-        self.edge_features: tuple[str, ...] = (*of_edges, *of_lines, forward)
+        self.edge_features: tuple[str, ...] = (*of_edges, *operator_line_features(operator_features), forward)
         """Names of the columns of ``edges``."""
         self.time_features: tuple[str, ...] = ("t", *times)
         """Names of the entries of ``t``."""

@@ -111,7 +111,7 @@ class NativeRows(EngineRows[Commands]):
         shift, scale = self._engine_normaliser
         self.transitions.write_observations(rows, shift, scale, out)
         if self._operator is not None:
-            self._operator.write(self._own_state(), rows, out)
+            self._operator.write(self.transitions.opened_state, rows, out)
 
     def _choices(self, ids: Any, actions: Any) -> tuple[I64, I64]:
         """Topology actions as the engine takes them: the first change of each and the one behind its last, int64 [n].

@@ -51,31 +51,31 @@ class OperatorFeatures:
         """The episode of row ``i`` has begun at this time in its scenario."""
         self._began[i] = round((began - _EPOCH).total_seconds()) // _MINUTE
 
-    def write(self, state: Handle[GridState], rows: I64, out: F32) -> None:
+    def write(self, state: GridState, rows: I64, out: F32) -> None:
         """Write what is observed of ``rows``, scaled, to the same rows of ``out``, float32 [n, feature].
 
         Args:
-            state: of all rows.
+            state: of all rows, opened for compiled functions.
             rows: int64 [k].
             out: observations.
         """
         self._write(state, rows, rows, rows, out)
         out[rows, self._first :] = (out[rows, self._first :] - self._shift) / self._scale
 
-    def write_raw(self, state: Handle[GridState], row: int, i: int, out: F32) -> None:
+    def write_raw(self, state: GridState, row: int, i: int, out: F32) -> None:
         """Write what is observed of one environment, in raw units, to ``out``, float32 [feature].
 
         Args:
-            state: of all rows, or a forecast.
+            state: of all rows, or a forecast, opened for compiled functions.
             row: which of its rows.
             i: the environment.
             out: an observation.
         """
         self._write(state, np.array([row]), np.array([i]), np.zeros(1, np.int64), out[np.newaxis])
 
-    def _write(self, state: Handle[GridState], rows: I64, environments: I64, places: I64, out: F32) -> None:
+    def _write(self, state: GridState, rows: I64, environments: I64, places: I64, out: F32) -> None:
         write_operator_features(
-            state.address,
+            state,
             rows,
             self._groups,
             self._began[environments],

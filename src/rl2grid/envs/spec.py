@@ -21,7 +21,14 @@ from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
 from rl2grid.mdp.actions import ActionCatalogue, ContinuousLayout, continuous_layout, level_catalogue
-from rl2grid.mdp.features import OPERATOR_FEATURES, feature_slices, physical_scale
+from rl2grid.mdp.features import (
+    ALL_GROUPS,
+    CALENDAR,
+    OPERATOR_FEATURES,
+    feature_slices,
+    operator_line_features,
+    physical_scale,
+)
 
 ELEMENTS = ("time", "gen", "load", "line", "element", "sub", "storage")
 """What entries of an observation can belong to; ``element`` is an entry of the topology vector."""
@@ -40,8 +47,8 @@ _OF = {
     "actual_dispatch": "gen",
     "curtailment": "gen",
     "curtailment_limit": "gen",
-    **dict.fromkeys(OPERATOR_FEATURES["calendar"], "time"),
-    **{name: "line" for group in ("trips", "attacks", "security") for name in OPERATOR_FEATURES[group]},
+    **dict.fromkeys(OPERATOR_FEATURES[CALENDAR], "time"),
+    **dict.fromkeys(operator_line_features(ALL_GROUPS), "line"),
 }
 """Features whose name does not begin with what they are of."""
 

@@ -22,7 +22,6 @@ from rl2grid.envs.operator_features import OperatorFeatures
 from rl2grid.envs.options import TaskOptions
 from rl2grid.envs.tasks import Task
 from rl2grid.errors import UsageError
-from rl2grid.handles import Handle
 from rl2grid.mdp.actions import (
     ActionCatalogue,
     StepAction,
@@ -108,7 +107,6 @@ class TaskEnvironments:
         self._operator: OperatorFeatures | None = None
         if options.operator_features is not None:
             self._operator = OperatorFeatures(task, options.operator_features, self.engine, shift, scale)
-        self._state_handle = Handle(self.state)
         self._catalogue = task_catalogue(task, self.grid)
         self._hash = action_set_hash(self.grid, task.level) if task.changes_topology else None
         self._plans: list[EpisodePlan | None] = [None] * n
@@ -212,9 +210,10 @@ class TaskEnvironments:
         effect = refusal(self.grid, verdict_on(self.state, i, played))
         result = self.transitions.simulate(i, played, horizon)
         observation = np.zeros(self._size, np.float32)
-        self._write_observation(self.transitions.opened_result(result), 0, observation)
+        forecast = self.transitions.opened_result(result)
+        self._write_observation(forecast, 0, observation)
         if self._operator is not None:
-            self._operator.write_raw(Handle(result), 0, i, observation)
+            self._operator.write_raw(forecast, 0, i, observation)
         self._scale(observation)
         info = {**_start_info(plan), **episode_info(result, 0, self.constraint)}
         info["action_effect"] = effect or clipping(self.grid, result, 0, played)
@@ -436,24 +435,15 @@ class TaskEnvironments:
 
     def _observe(self, i: int, out: NDArray[np.float32]) -> None:
         """Write what is observed of row ``i``, in raw units."""
-        self._write_observation(self.transitions.opened_state, i, out)
+        state = self.transitions.opened_state
+        self._write_observation(state, i, out)
         if self._operator is not None:
-            self._operator.write_raw(self._own_state(), i, i, out)
+            self._operator.write_raw(state, i, i, out)
 
     def _scale(self, out: NDArray[np.float32]) -> None:
         shift, scale = self._normaliser
         out -= shift
         out /= scale
-
-    def _own_state(self) -> Handle[GridState]:
-        """Where compiled code finds the state."""
-        if self._state_handle.structure is not self.state:
-            self._state_handle = Handle(self.state)
-        return self._state_handle
-
-    @property
-    def _state_address(self) -> int:
-        return self._own_state().address
 
     def _step_action(self, action: Any) -> StepAction:
         return step_action(self.task, self.grid, self._catalogue, action)

@@ -80,6 +80,8 @@ OPERATOR_FEATURES: dict[str, tuple[str, ...]] = {
     "security": ("loading_after_loss",),
 }
 """Features of each group that may be observed beside those of the paper, in this order."""
+CALENDAR = "calendar"
+"""The group whose features are of time; those of all others are of lines."""
 ALL_GROUPS = "all"
 
 _DAY = 24 * STEPS_PER_HOUR
@@ -161,6 +163,12 @@ def operator_groups(names: str | None) -> tuple[str, ...]:
     return tuple(group for group in OPERATOR_FEATURES if group in given)
 
 
+def operator_line_features(names: str | None) -> tuple[str, ...]:
+    """The features that a value of the keyword adds to every line, in order; errors as of :func:`operator_groups`."""
+    groups = (group for group in operator_groups(names) if group != CALENDAR)
+    return tuple(name for group in groups for name in OPERATOR_FEATURES[group])
+
+
 @functools.cache
 def _layout(grid: Grid, kind: str, operator_features: str | None) -> tuple[tuple[str, float, F32], ...]:
     """(name, shift, scale [entry]) of every feature, in order."""
@@ -220,7 +228,7 @@ def _planned_and_stored_features(grid: Grid) -> Rows:
 def _operator_features(grid: Grid, group: str) -> Rows:
     of_lines = {"steps_to_trip": grid.rules.overflow_allowed + 1, "steps_since_attack": _DAY}
     for name in OPERATOR_FEATURES[group]:
-        yield name, 0.0, 1.0 if group == "calendar" else np.full(grid.n_line, of_lines.get(name, 1.0))
+        yield name, 0.0, 1.0 if group == CALENDAR else np.full(grid.n_line, of_lines.get(name, 1.0))
 
 
 def _maintenance_window(grid: Grid) -> int:

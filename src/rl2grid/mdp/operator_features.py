@@ -16,7 +16,6 @@ from rl2grid.handles import opener
 from rl2grid.mdp.features import OPERATOR_FEATURES
 from rl2grid.mdp.security import Security, is_expected, loading_after_loss
 from rl2grid.mdp.state import GridState
-from rl2grid.mdp.state_handles import open_state
 
 open_security = opener(Security)
 """From the address of a handle to what may be lost, in compiled code."""
@@ -47,7 +46,7 @@ def note_attacks(state: GridState, i: int) -> None:
 
 @jit
 def write_operator_features(
-    address: int,
+    state: GridState,
     rows: I64,
     groups: Flags,
     began: I64,
@@ -60,8 +59,8 @@ def write_operator_features(
     """Write what is asked for of some environments, in raw units.
 
     Args:
-        address: of a handle to the state of all environments.
-        rows: environments, int64 [k].
+        state: of all environments, or a forecast of one.
+        rows: of the state, int64 [k].
         groups: which groups are written, one after the other, bool [group].
         began: when the episode of each began, in minutes since 1970, int64 [k].
         securities: addresses of handles to what may be lost in each, int64 [k], where that is asked for.
@@ -70,7 +69,6 @@ def write_operator_features(
         places: the row of ``out`` for each, int64 [k].
         out: observations, float32 [row, feature].
     """
-    state = open_state(address)
     for k in range(rows.shape[0]):
         i, own, end = rows[k], out[places[k]], begin
         if groups[CALENDAR]:

@@ -55,7 +55,7 @@ from rl2grid.algorithms.networks.graph_functions import (
 from rl2grid.arrays import I32
 from rl2grid.envs.spec import Spec
 from rl2grid.envs.tasks import find_task
-from rl2grid.mdp.features import OPERATOR_FEATURES, operator_groups, physical_scale
+from rl2grid.mdp.features import operator_line_features, physical_scale
 
 _URGENT_STEPS = 72.0
 """Steps after which planned maintenance counts e times less: six hours."""
@@ -97,8 +97,7 @@ class Features(nn.Module):
         self.has_topology = "topo_vect" in self.slices
         of_gens = [feature.name for feature in spec.features if feature.of == "gen"]
         self.dispatch = [name for name in of_gens if name not in ("gen_p", "gen_theta")]
-        known = operator_groups(spec.operator_features)
-        self.of_lines = [name for group in known if group != "calendar" for name in OPERATOR_FEATURES[group]]
+        self.of_lines = operator_line_features(spec.operator_features)
         self.times = [feature.name for feature in spec.features if feature.of == "time"]
         self.of_storage = [feature.name for feature in spec.features if feature.of == "storage"]
         self.reads_action = reads_action
