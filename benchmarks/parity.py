@@ -48,6 +48,7 @@ from rl2grid.engines.probes import KINDS, PROBES, Probe, make_probe
 from rl2grid.engines.reference.engine import ReferenceEngine
 from rl2grid.engines.transition import Transitions
 from rl2grid.envs.description import single_spaces
+from rl2grid.envs.options import DEFAULTS
 from rl2grid.envs.tasks import find_task
 from rl2grid.grids import GRID_IDS, Grid, load_grid
 from rl2grid.mdp.actions import StepAction, inject, legal_actions, level_catalogue
@@ -109,7 +110,7 @@ class TrainedProbe:
         observations, actions = single_spaces(task)
         environment = SimpleNamespace(
             task=task,
-            options=SimpleNamespace(normalize="physical"),
+            options=SimpleNamespace(**DEFAULTS),
             observation_space=observations,
             action_space=actions,
             action_masks=lambda: self._masks,
