@@ -16,11 +16,12 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from numpy.typing import NDArray
 
 from rl2grid.algorithms import dqn, lagrangian_ppo, ppo, sac, td3
 from rl2grid.algorithms.on_policy import advantages_of_rewards
+from rl2grid.algorithms.playing import check_discount
 from rl2grid.errors import UsageError
 
 GAMMA, NUM_ENVS, NUM_STEPS = 0.97, 4, 30
@@ -174,13 +175,24 @@ def test_grid_steps_and_returns_of_episodes_count_resets_too(name):
     assert metrics["charts/episodic_return"] == pytest.approx(np.mean(returns), rel=1e-6)
 
 
-def test_another_discount_than_that_of_the_environments_is_refused():
-    with pytest.raises(UsageError, match=r"by gamma=0.9, PPO learns with gamma=0.97: give both the same"):
-        made("ppo", gamma=0.9)
-    single = [lambda: gymnasium.make("rl2grid/bus14-T0-v0", gamma=0.9)]
-    envs = SyncVectorEnv(single, autoreset_mode=AutoresetMode.SAME_STEP)
+@pytest.mark.parametrize("vector", [SyncVectorEnv, partial(AsyncVectorEnv, context="spawn")], ids=["sync", "async"])
+def test_another_discount_than_that_of_gymnasiums_vectors_is_refused(vector):
+    make = partial(gymnasium.make, "rl2grid:rl2grid/bus14-T0-v0", gamma=0.9)
+    envs = vector([make], autoreset_mode=AutoresetMode.SAME_STEP)
     args = dqn.Args(gamma=GAMMA, seed=1, total_timesteps=10, num_envs=1, num_steps=10, mask_actions=False)
     with pytest.raises(UsageError, match=r"by gamma=0.9, DQN learns with gamma=0.97"):
         dqn.DQN(args, envs)
+    envs.close()
+
+
+def test_environments_of_others_in_processes_are_not_asked_for_their_discount():
+    envs = AsyncVectorEnv([partial(gymnasium.make, "CartPole-v1")], context="spawn")
+    check_discount("DQN", envs, GAMMA)
+    envs.close()
+
+
+def test_another_discount_than_that_of_the_environments_is_refused():
+    with pytest.raises(UsageError, match=r"by gamma=0.9, PPO learns with gamma=0.97: give both the same"):
+        made("ppo", gamma=0.9)
     # Without a heuristic rewards are of one grid step each, and none needs to be discounted.
     assert torch.is_tensor(next(made("ppo", gamma=None, heuristic=None).network.parameters()))

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium.spaces import Box, Dict, Discrete
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
 from rl2grid.errors import UsageError
@@ -58,13 +58,23 @@ def check_discount(algorithm: str, envs: VectorEnv[Any, Any, Any], gamma: float)
     Raises:
         UsageError: an environment that discounts the grid steps of its transitions does so by another factor.
     """
-    for played in (envs, *getattr(envs.unwrapped, "envs", ())):
-        theirs = getattr(getattr(played.unwrapped, "options", None), "gamma", None)
+    for options in _options_of(envs):
+        theirs = getattr(options, "gamma", None)
         if theirs is not None and theirs != gamma:
             raise UsageError(
                 f"The environments discount the steps of a transition by gamma={theirs}, {algorithm} learns with "
                 f"gamma={gamma}: give both the same."
             )
+
+
+def _options_of(envs: VectorEnv[Any, Any, Any]) -> list[Any]:
+    """Options of our environments, of a vector of ours or of several in one of Gymnasium's; none of others."""
+    vector: Any = envs.unwrapped
+    if isinstance(vector, AsyncVectorEnv):
+        # Asking a process for what its environment has not would end all of them.
+        return list(vector.get_attr("options")) if all(vector.call("has_wrapper_attr", "options")) else []
+    played = [vector, *(env.unwrapped for env in getattr(vector, "envs", ()))]
+    return [each.options for each in played if hasattr(each, "options")]
 
 
 def reported(infos: Mapping[str, Any], key: str, missing: NDArray[Any]) -> NDArray[Any]:
