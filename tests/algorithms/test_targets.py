@@ -22,6 +22,8 @@ from numpy.typing import NDArray
 from rl2grid.algorithms import dqn, lagrangian_ppo, ppo, sac, td3
 from rl2grid.algorithms.on_policy import advantages_of_rewards
 from rl2grid.algorithms.playing import check_discount
+from rl2grid.algorithms.registry import algorithm_names, find_algorithm
+from rl2grid.envs.joint import VectorJointAsBox, VectorJointAsDiscrete
 from rl2grid.errors import UsageError
 
 GAMMA, NUM_ENVS, NUM_STEPS = 0.97, 4, 30
@@ -33,7 +35,12 @@ TRAINERS: dict[str, tuple[Callable[..., Any], Any, str]] = {
     "sac": (sac.SAC, sac.Args, "T0"),
     "sac-continuous": (sac.SAC, sac.Args, "R"),
     "td3": (td3.TD3, td3.Args, "R"),
+    "ppo-joint": (ppo.PPO, ppo.Args, "H0"),
+    "dqn-joint": (dqn.DQN, dqn.Args, "H0"),
+    "td3-joint": (td3.TD3, td3.Args, "H0"),
 }
+"""Every algorithm that learns from what it plays, on each kind of action that it has code for: imitation learns from
+the returns of labels."""
 ON_POLICY = [name for name in TRAINERS if "ppo" in name]
 OFF_POLICY = [name for name in TRAINERS if "ppo" not in name]
 
@@ -87,9 +94,11 @@ class Diary:
 def made(name: str, gamma: float = GAMMA, **keywords: Any) -> Any:
     trainer, args, kind = TRAINERS[name]
     keywords = {"heuristic": "idle", "gamma": gamma, **keywords}
-    envs = gymnasium.make_vec(f"rl2grid/bus14-{kind}-v0", num_envs=NUM_ENVS, **keywords)
+    envs: Any = gymnasium.make_vec(f"rl2grid/bus14-{kind}-v0", num_envs=NUM_ENVS, **keywords)
+    if kind == "H0":
+        envs = VectorJointAsBox(envs) if trainer is td3.TD3 else VectorJointAsDiscrete(envs)
     shared = {"seed": 2, "total_timesteps": NUM_ENVS * NUM_STEPS, "num_envs": NUM_ENVS, "num_steps": NUM_STEPS}
-    masked = {"mask_actions": kind == "T0"}
+    masked = {"mask_actions": hasattr(envs.single_action_space, "n")}
     return trainer(args(gamma=GAMMA, **shared, **masked), envs)
 
 
@@ -118,6 +127,11 @@ def compare(
             compared += len(rows)
             episode, first = episode + 1, k + 1
     return compared
+
+
+def test_no_algorithm_is_left_out():
+    packaged = {find_algorithm(name).trainer for name in algorithm_names() if name != "imitation"}
+    assert packaged <= {trainer for trainer, _, _ in TRAINERS.values()}
 
 
 @pytest.mark.parametrize("name", ON_POLICY)
