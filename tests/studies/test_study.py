@@ -142,6 +142,13 @@ def test_included_studies_are_valid_at_every_scale(name: str):
     assert list(file["scale"]) == ["quick", "full"]
 
 
+def test_the_paper_at_full_scale_has_its_reward_hyperparameters_and_budget():
+    cells = parse_study(read_toml(included_studies()["paper"]), "full").cells
+    assert all(cell.environment["reward"] == "paper" for cell in cells)
+    trained = [cell for cell in cells if cell.training is not None]
+    assert all(cell.training.preset == "paper" and cell.decisions == 80_000_000 for cell in trained)
+
+
 @pytest.mark.parametrize("name", sorted(included_studies()))
 def test_cells_of_included_studies_can_be_compared(name: str):
     file = read_toml(included_studies()[name])
