@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 from sample_results import result
+from toy_runs import falling, request, toy_envs
 
 from rl2grid.algorithms.pretrained import pretrained
 from rl2grid.cli.main import main
@@ -16,7 +17,10 @@ from rl2grid.errors import UsageError
 from rl2grid.ledger import subjects
 from rl2grid.ledger.subjects import find_subject, play_test
 from rl2grid.records.ledger import agent_of, choice_hash, read_ledger
+from rl2grid.records.looks import budget
+from rl2grid.records.versions import TARGETS_VERSION
 from rl2grid.scenarios.splits import SPLIT_VERSION
+from rl2grid.training.runs import train
 
 
 @pytest.fixture
@@ -46,6 +50,25 @@ def test_an_agent_without_training_is_named_with_its_task(played):
     assert played[1]["scenarios"] == played[0]["scenarios"][:3]
     with pytest.raises(UsageError, match="Task"):
         find_subject("random@bus15-T0")
+
+
+def test_a_run_plays_its_last_policy_beside_the_best_and_tells_of_earlier_looks(played, tmp_path: Path, monkeypatch):
+    run = train(request(tmp_path / "run"), evaluate=falling, make_envs=toy_envs)
+    subject = find_subject(str(run), months=2)
+    assert (subject.training["best_after"], subject.training["decisions"], subject.heuristic) == (96, 384, "idle")
+    stored = play_test(subject)
+    assert [one["agent"] for one in played] == [run, run / "checkpoint.pt"]
+    assert [one["split"] for one in played] == ["test", "test"]
+    assert stored.last == stored.values != {}
+    asked = {"decisions": 384, "evaluate_every": 96, "validation_months": request(run).validation_months}
+    assert dict(budget(stored)) == asked
+    assert (stored.configuration["targets_version"], stored.training["tested_before"]) == (TARGETS_VERSION, False)
+    monkeypatch.setattr("rl2grid.ledger.subjects.was_evaluated", lambda folder, split: split == "test")
+    assert find_subject(str(run), months=2).training["tested_before"]
+    best_is_last = train(
+        request(tmp_path / "rising"), evaluate=lambda agent: {"survival": 1.0, "return": 2.0}, make_envs=toy_envs
+    )
+    assert find_subject(str(best_is_last), months=2).last is None
 
 
 def test_a_policy_of_the_package_is_tested_as_its_card_says(played):
