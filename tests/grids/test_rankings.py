@@ -1,5 +1,7 @@
 """The committed rankings."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from made_up_ranking import made_up_arrays, use_ranking
@@ -8,6 +10,7 @@ from rl2grid.errors import UsageError
 from rl2grid.evaluation import ranking as ranking_method
 from rl2grid.grids import GRID_IDS, load_grid
 from rl2grid.grids.rankings import ranking, ranking_hash, trials
+from rl2grid.mdp.actions import ActionKind, full_catalogue, level_ids
 
 
 @pytest.mark.parametrize("grid_id", GRID_IDS)
@@ -29,6 +32,37 @@ def test_a_ranking_tells_how_it_was_made(grid_id):
     assert metadata["grid"] == grid_id
     assert metadata["split"] == "train"
     assert sum(metadata["states"].values()) >= 200
+
+
+def switched(grid_id: str, level: int) -> set[int]:
+    """Lines that an action of a level switches."""
+    grid = load_grid(grid_id)
+    actions = full_catalogue(grid).take(level_ids(grid, level))
+    return set(actions.target[actions.kind == ActionKind.SWITCH].tolist())
+
+
+@pytest.mark.parametrize("grid_id", GRID_IDS)
+def test_lines_that_others_open_can_be_closed_in_level_0_or_the_documentation_names_them(grid_id):
+    grid, closed = load_grid(grid_id), switched(grid_id, 0)
+    known, _ = ranking_method._lines_to_close(grid, np.zeros(grid.n_line, np.int32))
+    assert set(known) <= closed
+    left_out = ranking(grid_id).metadata["tripped_and_not_closed_in_level_0"]
+    assert not set(map(int, left_out)) & closed
+    named = ", ".join(f"{line} ({times})" for line, times in left_out.items()) or "none"
+    counts = len(known), len(closed) - len(known), grid.n_line - len(closed)
+    row = f"| {grid_id} | {' | '.join(map(str, counts))} | {named} |"
+    assert row in (Path(__file__).parents[2] / "docs" / "actions.md").read_text()
+
+
+def test_what_level_1_closes_beside_level_0_is_documented():
+    more = {}
+    for grid_id in GRID_IDS:
+        left_out = map(int, ranking(grid_id).metadata["tripped_and_not_closed_in_level_0"])
+        more[grid_id] = set(left_out) & switched(grid_id, 1)
+    assert {grid_id: lines for grid_id, lines in more.items() if lines} == {
+        "bus118-M": {105},
+        "bus118-MOB-v1": {41, 60, 127},
+    }
 
 
 def test_hashes_differ_between_grids_and_follow_the_ids():
