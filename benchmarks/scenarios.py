@@ -31,6 +31,7 @@ from rl2grid.mdp.actions import DO_NOTHING, StepAction, level_catalogue, reconne
 from rl2grid.mdp.opponents import draw_opponent
 from rl2grid.powerflow.batch import NOTHING, SWITCH, Changes, Snapshot
 from rl2grid.powerflow.model import load_network
+from rl2grid.records.statistics import UNIT, Scores, estimate, median_score
 from rl2grid.scenarios.generator import generate_month
 from rl2grid.scenarios.generator.calendar import MONTH_ROWS, MONTH_STEPS, MONTHS, ROWS_PER_DAY, ROWS_PER_HOUR
 from rl2grid.scenarios.generator.constants import Constants, load_constants
@@ -103,13 +104,14 @@ def measure(grid_id: str, seeds: int) -> dict[str, Any]:
     values = np.array(survived)
     by_season = [values[np.isin(np.arange(seeds) % MONTHS, part)] for part in SEASON_MONTHS.values()]
     power, deviation = np.concatenate(slack), np.concatenate(deviations)
-    draws = np.random.default_rng(0).choice(values, (2000, len(values)))
+    scores = Scores(values[None, :, None], UNIT)
+    mean, median = estimate(scores), estimate(scores, median_score)
     return {
         "months": seeds,
-        "do_nothing_mean": round(float(values.mean()), 4),
-        "do_nothing_mean_interval": rounded(np.percentile(draws.mean(axis=1), [2.5, 97.5]), 4),
-        "do_nothing_median": round(float(np.median(values)), 4),
-        "do_nothing_median_interval": rounded(np.percentile(np.median(draws, axis=1), [2.5, 97.5]), 4),
+        "do_nothing_mean": round(mean.value, 4),
+        "do_nothing_mean_interval": rounded(np.array([mean.low, mean.high]), 4),
+        "do_nothing_median": round(median.value, 4),
+        "do_nothing_median_interval": rounded(np.array([median.low, median.high]), 4),
         "completed": round(float((values >= 1).mean()), 3),
         "mean_by_season": {name: round(float(v.mean()), 4) for name, v in zip(SEASON_MONTHS, by_season, strict=True)},
         "rows_overloaded": round(float(np.mean(loading)), 4),
