@@ -1,7 +1,10 @@
 """What the corrected target, the levels of the second ranking and the heuristic ``careful`` do to learning.
 
-Trainings of five seeds before and after, of the same budget, on the same generator and validated on the same months::
+Trainings of five seeds before and after, of the same budget, on the same generator and validated on the same months.
+Both are of revision 804a035d, which holds the results and to whose sources the patch applies; since then training
+months are drawn from a library, so that later revisions train on others::
 
+    git checkout 804a035d
     git clone . BEFORE && cd BEFORE               # a state in which all three are undone
     git apply benchmarks/first_target.patch       # the first transition counts what the reset played
     git checkout 34e98fe -- src/rl2grid/grids/data/bus14.ranking.npz src/rl2grid/grids/data/bus36-MO-v0.ranking.npz
