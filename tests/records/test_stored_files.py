@@ -201,6 +201,24 @@ def test_of_damaged_metrics_the_sound_rows_are_kept(tmp_path: Path):
     assert [row["step"] for row in read_rows(path)] == ["1", "3"]
 
 
+@pytest.mark.parametrize("content", [b"", b"\xff\xfe", b"a,b\n1,2\n", b"\n"])
+def test_metrics_that_were_emptied_or_replaced_are_set_aside_with_a_word(tmp_path: Path, content: bytes):
+    path = tmp_path / METRICS_FILE
+    path.write_bytes(content)
+    with pytest.warns(DamageWarning, match=r"0 of its rows are kept\. It was set aside as metrics\.csv\.damaged"):
+        MetricsFile(tmp_path, after_step=3).close()
+    assert (tmp_path / "metrics.csv.damaged").read_bytes() == content
+    assert list(read_rows(path)) == []
+
+
+def test_that_the_metrics_of_a_run_are_gone_is_said(tmp_path: Path):
+    MetricsFile(tmp_path).close()  # a run that begins has none yet
+    (tmp_path / METRICS_FILE).unlink()
+    with pytest.warns(DamageWarning, match="metrics.csv is missing: what it said of the first 3 decisions is lost"):
+        MetricsFile(tmp_path, after_step=3).close()
+    assert list(read_rows(tmp_path / METRICS_FILE)) == []
+
+
 # --- Folders of somebody else ---------------------------------------------------------------------------------------
 
 

@@ -11,10 +11,11 @@ aside, and the run goes on.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from rl2grid.errors import UsageError
+from rl2grid.errors import DamageWarning, UsageError
 from rl2grid.records.files import CHECKSUM, not_what, opened_line, read_text, sealed_line, set_aside, write_text
 
 METRICS_FILE = "metrics.csv"
@@ -147,14 +148,17 @@ def trained_seconds(run: Path) -> float:
 def _keep_rows_until(path: Path, step: int) -> None:
     """Cut the file behind its last complete row of a step up to ``step``; make it, with its header, if need be.
 
-    A damaged file is set aside; what is sound of it is kept.
+    A damaged file is set aside; what is sound of it is kept. That the file of a run that has begun is gone is said.
     """
     header = ",".join((*METRIC_COLUMNS, CHECKSUM)) + "\n"
-    if not path.exists() or path.stat().st_size < len(header):
+    if not path.exists():
+        if step >= 0:
+            why = f"{path} is missing: what it said of the first {step} decisions is lost."
+            warnings.warn(why, DamageWarning, stacklevel=2)
         write_text(path, header)
         return
     try:
-        head, *lines = path.read_bytes().decode("utf-8", errors="replace").splitlines(keepends=True)
+        head, *lines = path.read_bytes().decode("utf-8", errors="replace").splitlines(keepends=True) or [""]
     except MemoryError:
         head, lines = "", []
     kept, damaged = [header], head != header
