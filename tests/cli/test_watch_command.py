@@ -44,12 +44,7 @@ def test_others_play_the_same_month_on_the_same_page(capsys, tmp_path):
     ],
 )
 def test_bad_requests_are_refused_with_one_sentence(capsys, tmp_path, flags, words):
-    assert main(["watch", *flags, "--output", str(tmp_path)]) == 2
+    assert main(["watch", *flags, "--output", str(tmp_path / "watched")]) == 2
     (sentence,) = [line for line in capsys.readouterr().err.strip().splitlines() if line.startswith("rl2grid: ")]
     assert words in sentence
     assert not list(tmp_path.iterdir())
-
-
-def test_an_agent_that_is_not_there_leaves_no_folder(capsys, tmp_path):
-    assert main(["watch", "genius", "bus14-T0", "--output", str(tmp_path / "watched")]) == 2
-    assert not (tmp_path / "watched").exists()

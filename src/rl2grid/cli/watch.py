@@ -15,7 +15,7 @@ from rl2grid.cli.output import Output
 from rl2grid.engines import HEURISTICS
 from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
-from rl2grid.records.files import make_folder
+from rl2grid.records.files import check_folder, make_folder
 from rl2grid.scenarios.splits import SPLITS
 
 if TYPE_CHECKING:
@@ -56,10 +56,11 @@ def _run(options: argparse.Namespace, output: Output) -> int:
     _check_agents(task, options)
     for suffix in options.format:
         animation.check_encoder(suffix)
-    make_folder(options.output)
+    check_folder(options.output)
     try:
         with _progress(output) as progress:
             recordings = [_play(agent, task, options, progress) for agent in (options.agent, *options.against)]
+            make_folder(options.output)
             files = _files(task, recordings, options)
             there = {file for file in files if file.exists()}
             for file, shown in files.items():
@@ -83,7 +84,7 @@ def _run(options: argparse.Namespace, output: Output) -> int:
 
 
 def _check_agents(task: Task, options: argparse.Namespace) -> None:
-    """Refuse agents that are not to be had, before a folder is made and the first of several has played."""
+    """Refuse agents that are not to be had, before the first of several has played."""
     from rl2grid.evaluation.agents import make_agent
 
     for agent in (options.agent, *options.against):
