@@ -157,6 +157,15 @@ def test_an_own_agent_is_watched(folder: Path, capsys):
     assert "3 of 8,064 steps" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("name", ["../elsewhere/x", "<!--<script>{data}", r"\x1b[31m red", "n" * 300])
+def test_any_name_of_an_agent_can_be_watched(folder: Path, name: str):
+    (folder / "named.py").write_text(AGENT.replace('"constant: 0"', f'"{name}"'))
+    assert main(["watch", "named.py:Constant", "bus14-T0", "--steps", "2", "--format", "html"]) == 0
+    (page,) = (folder / "watched").iterdir()
+    assert page.name.isprintable()
+    assert not set(page.name) & set("/<>{}[ ")
+
+
 def test_an_agent_that_says_its_version_keeps_it(folder: Path):
     (folder / "versioned.py").write_text(
         AGENT.replace('    name = "constant: 0"', '    name, identity = "v", {"version": 2}')

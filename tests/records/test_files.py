@@ -9,7 +9,15 @@ from pathlib import Path
 import pytest
 
 from rl2grid.errors import UsageError
-from rl2grid.records.files import check_folder, make_folder, read_json, write_json, write_record, write_text
+from rl2grid.records.files import (
+    check_folder,
+    in_file_name,
+    make_folder,
+    read_json,
+    write_json,
+    write_record,
+    write_text,
+)
 
 
 def test_a_file_that_cannot_be_written_whole_stays_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -80,3 +88,20 @@ def test_a_record_whose_checksum_was_removed_is_meant(tmp_path: Path):
     path = tmp_path / "record.json"
     path.write_text('{"number": 42}')
     assert read_json(path, "a record", "write it again") == {"number": 42}
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        ("ppo", "ppo"),
+        ("dc-opf+1.5", "dc-opf+1.5"),
+        ("../../x", "..-..-x"),
+        ("mine<!--<script>{data}\x1b[31m", "mine----script-data-31m"),
+        ("n" * 500, "n" * 120),
+        ("网" * 500, "网" * 40),
+    ],
+)
+def test_a_text_becomes_a_part_of_the_name_of_a_file(text: str, part: str, tmp_path: Path):
+    assert in_file_name(text) == part
+    (tmp_path / f"before-{part}.html").touch()
+    assert [path.parent for path in tmp_path.rglob("*.html")] == [tmp_path]

@@ -15,7 +15,7 @@ from rl2grid.cli.output import Output
 from rl2grid.engines import HEURISTICS
 from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
-from rl2grid.records.files import check_folder, make_folder
+from rl2grid.records.files import check_folder, in_file_name, make_folder
 from rl2grid.scenarios.splits import SPLITS
 
 if TYPE_CHECKING:
@@ -99,11 +99,11 @@ def _files(task: Task, recordings: Sequence[Recording], options: argparse.Namesp
     files: dict[Path, list[Recording]] = {}
     for suffix in options.format:
         if suffix == "html":
-            together = "-against-".join(each.agent for each in recordings)
+            together = in_file_name("-against-".join(each.agent for each in recordings))
             files[options.output / f"{begin}-{together}-{end}.html"] = list(recordings)
             continue
         for agent, recording in zip(agents, recordings, strict=True):
-            files[options.output / f"{begin}-{agent}-{end}.{suffix}"] = [recording]
+            files[options.output / f"{begin}-{in_file_name(agent)}-{end}.{suffix}"] = [recording]
     return files
 
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 from rl2grid.agents.agent import Agent
 from rl2grid.algorithms.pretrained import is_pretrained
 from rl2grid.envs.tasks import Task
 from rl2grid.evaluation.own_agents import is_own
+from rl2grid.records.files import in_file_name
 
 
 def default_folder(agent: str | Path, made: Agent, task: Task, kind: str, name: str) -> Path:
@@ -35,7 +35,7 @@ def _in_paths(agent: str, made: Agent) -> str:
         return made.name
     if not is_own(agent):
         return agent
-    name = re.sub(r"[^\w.+-]+", "-", made.name)
+    name = in_file_name(made.name)
     version = getattr(made, "identity", None)
     source = version.get("source_hash", "") if isinstance(version, dict) else ""
     return f"{name}-{source[:8]}" if source else name

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import sys
 import warnings
 import zlib
@@ -21,6 +22,8 @@ from rl2grid.errors import DamageWarning, UsageError
 
 CHECKSUM = "checksum"
 """Entry of a JSON file, and name of the last column of a file that grows."""
+NAME_BYTES = 120
+"""Of a part of the name of a file; systems allow 255 for the whole name."""
 MAX_BYTES = 2**28
 """Of a file of text: a larger one is none that was written here."""
 DAMAGED = ".damaged"
@@ -195,6 +198,14 @@ def set_aside(path: Path, why: str) -> Path:
 def printable(text: str) -> str:
     """A text without what would move a cursor, ring a bell, hide or turn other text: such letters become spaces."""
     return "".join(letter if letter.isprintable() else " " for letter in text)
+
+
+def in_file_name(text: str) -> str:
+    """A text as a part of the name of a file or folder: no separators, nothing that a shell or a terminal acts on.
+
+    What is left out becomes hyphens, and of a long text there is its beginning, of at most :data:`NAME_BYTES`.
+    """
+    return re.sub(r"[^\w.+-]+", "-", text).encode()[:NAME_BYTES].decode(errors="ignore")
 
 
 def make_folder(path: Path) -> None:
