@@ -54,7 +54,14 @@ def test_a_folder_below_a_file_is_refused(tmp_path: Path, refuse: Callable[[Path
 def test_looking_makes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     check_folder(Path("a") / "b")
+    check_folder(tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_file_is_no_folder_that_could_be_made(tmp_path: Path):
+    (tmp_path / "file").touch()
+    with pytest.raises(UsageError, match=r"cannot be made: it is a file\.$"):
+        check_folder(tmp_path / "file")
 
 
 def test_a_folder_below_one_that_may_not_be_written_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

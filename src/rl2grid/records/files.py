@@ -221,12 +221,16 @@ def make_folder(path: Path) -> None:
 
 
 def check_folder(path: Path) -> None:
-    """Look whether a folder that does not exist yet could be made, without making it.
+    """Look whether a folder is there or could be made, without making it.
 
     Raises:
-        UsageError: it could not.
+        UsageError: neither.
     """
     # os.path: unlike Path.exists, it does not raise below a folder that may not be read.
+    if os.path.exists(path):
+        if not path.is_dir():
+            raise _cannot_be_made(path, "it is a file")
+        return
     above = next(parent for parent in path.absolute().parents if os.path.exists(parent))
     if not above.is_dir():
         raise _cannot_be_made(path, f"{above} is no folder")
