@@ -27,6 +27,7 @@ _PARTS = {
     "rl2grid.powerflow": "the power flow",
     "rl2grid.scenarios": "what makes the months",
     "rl2grid.mdp": "the rules",
+    "rl2grid.dense": "the networks",
 }
 """What the functions of a layer are, for people."""
 

@@ -1,0 +1,5 @@
+"""Layers of small networks in compiled code: the same bits on every processor, whatever the batch and the threads.
+
+:mod:`rl2grid.dense.tiles` multiplies a tile of two matrices in registers, :mod:`rl2grid.dense.layers` computes layers
+and their gradients with it.
+"""
