@@ -148,7 +148,9 @@ def ppo_pair(seed: int, *, continuous: bool, **theirs: Any) -> Pair:
         ours.network.actor[-1].weight.mul_(100.0)  # type: ignore[union-attr, operator]
         if continuous:
             ours.network.log_std.copy_(torch.linspace(-1.0, 0.5, ACTION_SIZE))
-    ours.optimizer = torch.optim.SGD([{"params": parameters} for parameters in ours._groups], lr=RATE)  # type: ignore[assignment]
+    ours.actor_optimizer, ours.critic_optimizer = (  # type: ignore[assignment]
+        torch.optim.SGD(optimizer.param_groups, lr=RATE) for optimizer in (ours.actor_optimizer, ours.critic_optimizer)
+    )
     model = stable_baselines3.PPO(
         "MlpPolicy",
         their_scripts(seed, NUM_ENVS, continuous=continuous),
@@ -311,7 +313,7 @@ def test_ppo_normalises_advantages_by_their_own_deviation(continuous: bool):
     """That of the minibatch itself; theirs is the estimate with n - 1."""
     ours, theirs = ppo_pair(0, continuous=continuous, normalize_advantage=True)
     batch = minibatch_of(random_rollout(ours, 0))
-    loss = ppo.losses(ours.network, batch, ppo_args(0, continuous=continuous, normalize_advantages=True))
+    loss = ppo.policy_losses(ours.network, batch, ppo_args(0, continuous=continuous, normalize_advantages=True))
     n = len(batch.actions)
     agree(loss.policy, train_theirs(theirs, batch)["train/policy_gradient_loss"] * np.sqrt(n / (n - 1)))
 
@@ -325,7 +327,7 @@ def test_ppo_clips_the_value_loss_to_the_larger_of_their_two():
     theirs.clip_range_vf = lambda _: 0.2
     clipped = [train_theirs(theirs, one)["train/value_loss"] for one in single]
     assert (np.greater(clipped, plain).any(), np.less(clipped, plain).any()) == (True, True)
-    loss = ppo.losses(ours.network, batch, ppo_args(1, continuous=False, clip_value_loss=True))
+    loss = ppo.critic_losses(ours.network, batch, ppo_args(1, continuous=False, clip_value_loss=True))
     agree(loss.value, 0.5 * np.maximum(plain, clipped).mean())
 
 
@@ -344,14 +346,11 @@ def test_lagrangian_ppo_without_a_price_has_the_losses_of_ppo(seed: int, continu
     lagrangian.load_state_dict(ours.network.state_dict(), strict=False)
     args = lagrangian_ppo.Args(normalize_advantages=False, mask_actions=False, clip_coefficient=0.2)
     advantages = lagrangian_ppo.lagrangian_advantages(batch.advantages, costs, torch.zeros(2))
-    loss = lagrangian_ppo.losses(
-        lagrangian,
-        lagrangian_ppo.Minibatch(**{**vars(batch), "advantages": advantages}, cost_values=costs, cost_returns=costs),
-        args,
-    )
-    record = train_theirs(theirs, batch)
+    columns = {**vars(batch), "advantages": advantages}
+    priced = lagrangian_ppo.Minibatch(**columns, cost_values=costs, cost_returns=costs)
+    loss, record = ppo.policy_losses(lagrangian, priced, args), train_theirs(theirs, batch)
     agree(loss.policy, record["train/policy_gradient_loss"])
-    agree(loss.value, 0.5 * record["train/value_loss"])
+    agree(lagrangian_ppo.critic_losses(lagrangian, priced, args).value, 0.5 * record["train/value_loss"])
     agree(loss.entropy, -record["train/entropy_loss"])
 
 

@@ -28,9 +28,9 @@ from rl2grid.algorithms.lagrangian_ppo import (
     Multipliers,
     Rollout,
     advantages_of_costs,
+    critic_losses,
     lagrangian_advantages,
     load_policy,
-    losses,
     preset,
 )
 from rl2grid.algorithms.on_policy import advantages_of_rewards
@@ -412,20 +412,21 @@ PLAIN = replace(SMALL, normalize_advantages=False, entropy_coefficient=0.0, valu
 
 
 def test_losses_by_hand():
-    loss = losses(Scripted(), BATCH, replace(PLAIN, entropy_coefficient=0.1))
+    args = replace(PLAIN, entropy_coefficient=0.1)
+    loss, of_critics = ppo.policy_losses(Scripted(), BATCH, args), critic_losses(Scripted(), BATCH, args)
     # min(ratio A, clip(ratio, 0.8, 1.2) A): 2.4, -0.8, 3.3, -1.5
     assert float(loss.policy) == pytest.approx(-(2.4 - 0.8 + 3.3 - 1.5) / 4)
-    assert float(loss.value) == pytest.approx(0.5 * (0.25 + 0.36 + 1.0 + 0.0) / 4)
-    assert loss.cost_values.tolist() == pytest.approx([0.5 * (1.0 + 1.0 + 0.0 + 4.0) / 4, 0.5 * 1.0])
+    assert float(of_critics.value) == pytest.approx(0.5 * (0.25 + 0.36 + 1.0 + 0.0) / 4)
+    assert of_critics.cost_values.tolist() == pytest.approx([0.5 * (1.0 + 1.0 + 0.0 + 4.0) / 4, 0.5 * 1.0])
     assert float(loss.entropy) == pytest.approx(0.25)
-    parts = float(loss.policy) - 0.1 * 0.25 + 0.5 * (float(loss.value) + 0.75 + 0.5)
-    assert float(loss.total.detach()) == pytest.approx(parts)
+    assert float(loss.total.detach()) == pytest.approx(float(loss.policy) - 0.1 * 0.25)
+    assert float(of_critics.total.detach()) == pytest.approx(0.5 * (float(of_critics.value) + 0.75 + 0.5))
     assert float(loss.clip_fraction) == pytest.approx(3 / 4)
     assert float(loss.approximate_kl) == pytest.approx(np.mean([r - 1 - math.log(r) for r in RATIOS]), rel=1e-5)
 
 
 def test_clipped_value_losses_by_hand():
-    loss = losses(Scripted(), BATCH, replace(PLAIN, clip_value_loss=True))
+    loss = critic_losses(Scripted(), BATCH, replace(PLAIN, clip_value_loss=True))
     # Clipped to within 0.2 of the old values: 0.2, 0.8, 2.0, 0.1; the larger error counts.
     assert float(loss.value) == pytest.approx(0.5 * (0.64 + 0.36 + 1.0 + 0.0) / 4)
     # 0.7, 0.0, 3.0, 1.2 and 4.2: errors 1.69, 1.0, 0.0, 4.0 (unclipped) and 1.0 (unclipped)
@@ -655,17 +656,22 @@ def test_learning_rates_of_all_critics_fall_to_zero():
     rates = []
     while not learner.finished:
         learner.iterate()
-        rates.append([group["lr"] for group in learner.optimizer.param_groups])
+        rates.append([group["lr"] for group in groups_of(learner)])
     np.testing.assert_allclose(rates, np.outer([1.0, 0.75, 0.5, 0.25], [1e-3, 4e-3, 4e-3, 4e-3]))
 
 
 def test_gradients_of_every_critic_are_scaled_down_one_by_one():
     learner = trainer(max_grad_norm=1e-3, num_minibatches=1, update_epochs=1)
     learner.iterate()
-    assert len(learner._groups) == 4
-    for group in learner._groups:
-        norm = torch.stack([p.grad.norm() for p in group if p.grad is not None]).norm()
+    assert len(groups_of(learner)) == 4
+    for group in groups_of(learner):
+        norm = torch.stack([p.grad.norm() for p in group["params"] if p.grad is not None]).norm()
         assert 0.0 < float(norm) <= 1e-3 * (1 + 1e-4)
+
+
+def groups_of(learner: LagrangianPPO) -> list[dict[str, Any]]:
+    """What optimisers move, the actor's weights first."""
+    return [*learner.actor_optimizer.param_groups, *learner.critic_optimizer.param_groups]
 
 
 def test_a_single_constraint_has_metrics_without_its_name():

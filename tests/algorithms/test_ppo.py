@@ -18,6 +18,7 @@ from torch import Tensor
 from toy_grid import ToyGrid
 
 from rl2grid.algorithms.checkpoint import load_checkpoint, save_checkpoint
+from rl2grid.algorithms.pair import Pair
 from rl2grid.algorithms.ppo import (
     PPO,
     SEARCH_SPACE,
@@ -26,8 +27,9 @@ from rl2grid.algorithms.ppo import (
     Minibatch,
     Rollout,
     advantages_of_rewards,
+    critic_losses,
     load_policy,
-    losses,
+    policy_losses,
     preset,
 )
 from rl2grid.errors import UsageError
@@ -277,7 +279,7 @@ def test_the_ratio_before_any_update_is_one(continuous: bool):
     torch.testing.assert_close(
         (log_probabilities - batch.log_probabilities).exp(), torch.ones(len(order)), rtol=0, atol=1e-5
     )
-    loss = losses(ppo.network, batch, ppo.args)
+    loss = policy_losses(ppo.network, batch, ppo.args)
     assert float(loss.approximate_kl) == pytest.approx(0.0, abs=1e-6)
     assert float(loss.clip_fraction) == 0.0
 
@@ -382,7 +384,7 @@ def test_the_log_standard_deviations_are_trained_and_saved(tmp_path: Path):
     ppo.iterate()
     trained = ppo.network.log_std.detach().clone()
     assert not torch.equal(trained, start)
-    optimised = [id(parameter) for group in ppo.optimizer.param_groups for parameter in group["params"]]
+    optimised = [id(parameter) for group in groups_of(ppo) for parameter in group["params"]]
     assert sorted(optimised) == sorted(id(parameter) for parameter in ppo.network.parameters())
     save_checkpoint(tmp_path / "c.pt", {"task": "t", "policy": ppo.policy_state()})
     assert torch.equal(load_policy(load_checkpoint(tmp_path / "c.pt")["policy"]).log_std.detach(), trained)
@@ -439,7 +441,7 @@ def scripted() -> Scripted:
 
 
 def test_the_policy_loss_by_hand():
-    loss = losses(scripted(), BATCH, PLAIN)
+    loss = policy_losses(scripted(), BATCH, PLAIN)
     # min(ratio A, clip(ratio, 0.8, 1.2) A): 2.4, -0.8, 3.3, -1.5
     assert float(loss.policy) == pytest.approx(-(2.4 - 0.8 + 3.3 - 1.5) / 4)
     assert float(loss.clip_fraction) == pytest.approx(3 / 4)
@@ -448,30 +450,32 @@ def test_the_policy_loss_by_hand():
 
 def test_the_value_loss_by_hand():
     errors = [0.25, 0.36, 1.0, 0.0]
-    assert float(losses(scripted(), BATCH, PLAIN).value) == pytest.approx(0.5 * sum(errors) / 4)
+    assert float(critic_losses(scripted(), BATCH, PLAIN).value) == pytest.approx(0.5 * sum(errors) / 4)
     # Clipped to within 0.2 of the old values: 0.2, 0.8, 2.0, 0.1; the larger error counts.
     clipped = [0.64, 0.36, 1.0, 0.0]
-    loss = losses(scripted(), BATCH, replace(PLAIN, clip_value_loss=True))
+    loss = critic_losses(scripted(), BATCH, replace(PLAIN, clip_value_loss=True))
     assert float(loss.value) == pytest.approx(0.5 * sum(clipped) / 4)
 
 
-def test_the_total_loss_by_hand():
-    loss = losses(scripted(), BATCH, replace(PLAIN, entropy_coefficient=0.1))
+def test_the_total_losses_by_hand():
+    args = replace(PLAIN, entropy_coefficient=0.1)
+    loss, of_critic = policy_losses(scripted(), BATCH, args), critic_losses(scripted(), BATCH, args)
     assert float(loss.entropy) == pytest.approx(0.25)
-    assert float(loss.total.detach()) == pytest.approx(float(loss.policy) + 0.5 * float(loss.value) - 0.1 * 0.25)
+    assert float(loss.total.detach()) == pytest.approx(float(loss.policy) - 0.1 * 0.25)
+    assert float(of_critic.total.detach()) == pytest.approx(0.5 * float(of_critic.value))
 
 
 def test_advantages_are_normalised_over_the_minibatch():
     advantages = BATCH.advantages.numpy()
     normalised = (advantages - advantages.mean()) / advantages.std()
     expected = np.minimum(np.array(RATIOS) * normalised, np.clip(RATIOS, 0.8, 1.2) * normalised).mean()
-    loss = losses(scripted(), BATCH, replace(PLAIN, normalize_advantages=True))
+    loss = policy_losses(scripted(), BATCH, replace(PLAIN, normalize_advantages=True))
     assert float(loss.policy) == pytest.approx(-expected, rel=1e-5)
 
 
 def test_good_actions_become_more_probable_and_clipped_ones_are_left_alone():
     network = scripted()
-    losses(network, BATCH, PLAIN).total.backward()  # type: ignore[no-untyped-call]
+    policy_losses(network, BATCH, PLAIN).total.backward()  # type: ignore[no-untyped-call]
     gradient = network.log_probabilities.grad
     assert gradient is not None
     assert gradient.tolist() == pytest.approx([0.0, 0.0, -3.3 / 4, 1.5 / 4])
@@ -558,13 +562,13 @@ def test_learning_rates_fall_to_zero_over_the_run_or_stay():
     ppo = trainer(total_timesteps=4 * 16 * 4, actor_learning_rate=1e-3, critic_learning_rate=4e-3)
     rates = []
     while not ppo.finished:
-        assert ppo.iterate()["charts/learning_rate"] == ppo.optimizer.param_groups[0]["lr"]
-        rates.append([group["lr"] for group in ppo.optimizer.param_groups])
+        assert ppo.iterate()["charts/learning_rate"] == groups_of(ppo)[0]["lr"]
+        rates.append([group["lr"] for group in groups_of(ppo)])
     np.testing.assert_allclose(rates, np.outer([1.0, 0.75, 0.5, 0.25], [1e-3, 4e-3]))
     ppo = trainer(anneal_learning_rate=False)
     ppo.iterate()
     ppo.iterate()
-    assert ppo.optimizer.param_groups[1]["lr"] == 3e-4
+    assert groups_of(ppo)[1]["lr"] == 3e-4
 
 
 def test_an_update_ends_early_when_the_policy_moved_too_far():
@@ -575,9 +579,24 @@ def test_an_update_ends_early_when_the_policy_moved_too_far():
 def test_gradients_are_scaled_down_to_the_norm_asked_for():
     ppo = trainer(max_grad_norm=1e-3, num_minibatches=1, update_epochs=1)
     ppo.iterate()
-    for group in ppo._groups:
-        norm = torch.stack([p.grad.norm() for p in group if p.grad is not None]).norm()
+    for group in groups_of(ppo):
+        norm = torch.stack([p.grad.norm() for p in group["params"] if p.grad is not None]).norm()
         assert 0.0 < float(norm) <= 1e-3 * (1 + 1e-4)
+
+
+def groups_of(ppo: PPO) -> list[dict[str, Any]]:
+    """What optimisers move, the actor's weights first."""
+    return [*ppo.actor_optimizer.param_groups, *ppo.critic_optimizer.param_groups]
+
+
+@BOTH
+def test_networks_that_learn_at_once_learn_the_same(continuous: bool):
+    one, two = trainer(continuous), trainer(continuous)
+    two._pair = Pair(at_once=True)
+    for _ in range(3):
+        mine, theirs = one.iterate(), two.iterate()
+        assert all(mine[name] == theirs[name] for name in mine if name.startswith("losses/"))
+    assert_same(one.network.state_dict(), two.network.state_dict())
 
 
 def test_metrics_of_episodes_are_those_of_the_episodes():

@@ -203,19 +203,19 @@ class Minibatch(on_policy.Minibatch):
 
 
 @dataclass(frozen=True)
-class Losses(on_policy.Losses):
-    """The loss, its parts, and how far the policy has moved; scalars but for the costs' part."""
+class CriticLosses(on_policy.CriticLosses):
+    """What the critics minimise, and its parts; scalars but for that of the costs."""
 
     cost_values: Tensor
     """[constraint]"""
 
 
-def losses(network: ActorCritic, batch: Minibatch, args: Args) -> Losses:
-    """PPO's loss of the advantages of the Lagrangian, and the squared errors of the costs' critics."""
-    of_ppo = ppo.losses(network, batch, args)
+def critic_losses(network: ActorCritic, batch: Minibatch, args: Args) -> CriticLosses:
+    """The squared errors of the critic and of the costs' critics."""
+    of_ppo = ppo.critic_losses(network, batch, args)
     cost_values = ppo.value_loss(network.cost_values(batch.observations), batch.cost_values, batch.cost_returns, args)
-    parts = {**vars(of_ppo), "total": of_ppo.total + args.value_coefficient * cost_values.sum()}
-    return Losses(**parts, cost_values=cost_values.detach())
+    total = of_ppo.total + args.value_coefficient * cost_values.sum()
+    return CriticLosses(total, of_ppo.value, cost_values.detach())
 
 
 # --- Training -------------------------------------------------------------------------------------------------------
@@ -303,20 +303,20 @@ class LagrangianPPO(ppo.PPO):
             cost_returns=(cost_advantages + rollout.cost_values).flatten(0, 1),
         )
 
-    def further_metrics(self, data: on_policy.Minibatch, history: list[Any]) -> dict[str, float]:
+    def further_metrics(self, data: on_policy.Minibatch, history: on_policy.History) -> dict[str, float]:
         """The losses of the costs' critics, and how well they predict."""
         assert isinstance(data, Minibatch)
         metrics = {}
         for i, name in enumerate(_metric_names("losses/cost_value_loss", self.constraints)):
-            metrics[name] = mean(loss.cost_values[i] for loss in history)
+            metrics[name] = mean(loss.cost_values[i] for loss in history.critics)
         for i, name in enumerate(_metric_names("losses/cost_explained_variance", self.constraints)):
             metrics[name] = explained_variance(data.cost_values[..., i], data.cost_returns[..., i])
         return metrics
 
-    def losses(self, batch: on_policy.Minibatch) -> Losses:
-        """See :func:`losses`."""
+    def critic_losses(self, batch: on_policy.Minibatch) -> CriticLosses:
+        """See :func:`critic_losses`."""
         assert isinstance(batch, Minibatch)
-        return losses(self.network, batch, self.args)
+        return critic_losses(self.network, batch, self.args)
 
     def state_dict(self) -> dict[str, Any]:
         """See :class:`Trainer`."""

@@ -44,6 +44,7 @@ from torch import Tensor, nn
 from rl2grid.algorithms.descent import Adam, descend
 from rl2grid.algorithms.diagnostics import mean
 from rl2grid.algorithms.networks import PER_ACTION, VALUE, NetworkFactory, orthogonal
+from rl2grid.algorithms.pair import Pair
 from rl2grid.algorithms.playing import Tally
 from rl2grid.algorithms.sampling import drawn, legal_log_softmax
 from rl2grid.algorithms.starting import StartingPolicy
@@ -332,19 +333,40 @@ class Minibatch:
         }
         return type(self)(**columns)
 
+    def split(self, n: int) -> list[Self]:
+        """``n`` parts, alike in size to one row."""
+        columns: dict[str, Any] = {
+            name: [None] * n if array is None else array.tensor_split(n) for name, array in vars(self).items()
+        }
+        return [type(self)(**{name: parts[k] for name, parts in columns.items()}) for k in range(n)]
+
 
 @dataclass(frozen=True)
-class Losses:
-    """The loss, its parts, and how far the policy has moved; all scalars."""
+class PolicyLosses:
+    """What the policy minimises, its parts, and how far the policy has moved; all scalars."""
 
     total: Tensor
     policy: Tensor
-    value: Tensor
     entropy: Tensor
     approximate_kl: Tensor
     """mean of (ratio - 1) - log ratio, an unbiased estimate of KL(old || new) (Schulman, 2020)"""
     clip_fraction: Tensor
     """share of ratios outside 1 +- clip_coefficient"""
+
+
+@dataclass(frozen=True)
+class CriticLosses:
+    """What the critics minimise, and its parts; all scalars."""
+
+    total: Tensor
+    value: Tensor
+
+
+class History(NamedTuple):
+    """The losses of every minibatch of an update."""
+
+    policy: list[PolicyLosses]
+    critics: list[Any]
 
 
 class OnPolicyTrainer(Trainer):
@@ -374,9 +396,10 @@ class OnPolicyTrainer(Trainer):
         )
         self.network.to(self.device)
         critics = (self.network.critic, *self.network.cost_critics)
-        self._groups = (self.network.actor_parameters(), *(list(critic.parameters()) for critic in critics))
-        groups = [{"params": parameters} for parameters in self._groups]
-        self.optimizer = Adam(groups, lr=args.actor_learning_rate, eps=1e-5)
+        groups = [{"params": list(critic.parameters())} for critic in critics]
+        self.actor_optimizer = Adam(self.network.actor_parameters(), lr=args.actor_learning_rate, eps=1e-5)
+        self.critic_optimizer = Adam(groups, lr=args.critic_learning_rate, eps=1e-5)
+        self._pair = Pair(getattr(envs.unwrapped, "num_threads", 1) > 1 and self.device.type == "cpu")
         self.teacher: ActorCritic | None = None
         """What the policy was at the beginning, if it is that of another run."""
         self._divergences: list[Tensor] = []
@@ -409,8 +432,12 @@ class OnPolicyTrainer(Trainer):
         """Improve the networks on a rollout; transitions that no decision began are left out."""
 
     @abstractmethod
-    def losses(self, batch: Any) -> Losses:
-        """What is minimised on a minibatch."""
+    def policy_losses(self, batch: Any) -> PolicyLosses:
+        """What the policy minimises on a minibatch; called in a thread beside :meth:`critic_losses`."""
+
+    @abstractmethod
+    def critic_losses(self, batch: Any) -> CriticLosses:
+        """What the critics minimise on a minibatch."""
 
     def before_update(self) -> dict[str, float]:
         """What is to be done between a rollout and the update on it, and its metrics."""
@@ -506,8 +533,10 @@ class OnPolicyTrainer(Trainer):
             torch.cat(last) if last else None,
         )
 
-    def improve(self, data: Minibatch, decided: Tensor) -> tuple[list[Any], int]:
+    def improve(self, data: Minibatch, decided: Tensor) -> tuple[History, int]:
         """Descend on minibatches of the transitions that a decision began, epoch after epoch.
+
+        The policy and the critics have no weights in common: each goes through the minibatches of an epoch on its own.
 
         Args:
             data: All transitions [num_steps * num_envs, ...].
@@ -517,16 +546,19 @@ class OnPolicyTrainer(Trainer):
             The losses of every minibatch, and the number of epochs.
         """
         args, rows = self.args, decided.nonzero().squeeze(-1)
-        history: list[Losses] = []
+        history = History([], [])
         epochs = 0
         for _ in range(args.update_epochs if len(rows) else 0):
             order = rows[torch.randperm(len(rows), generator=self.generator).to(self.device)]
-            first = len(history)
-            for chosen in order.tensor_split(args.num_minibatches):
-                if len(chosen):
-                    history.append(self._descend(data.rows(chosen)))
+            batches = data.rows(order).split(min(args.num_minibatches, len(rows)))
+            policy, critics = self._pair.run(
+                lambda batches=batches: [self._improve_policy(batch) for batch in batches],
+                lambda batches=batches: [self._improve_critics(batch) for batch in batches],
+            )
+            history.policy.extend(policy)
+            history.critics.extend(critics)
             epochs += 1
-            if args.target_kl is not None and mean(loss.approximate_kl for loss in history[first:]) > args.target_kl:
+            if args.target_kl is not None and mean(loss.approximate_kl for loss in policy) > args.target_kl:
                 break
         return history, epochs
 
@@ -536,15 +568,18 @@ class OnPolicyTrainer(Trainer):
         rates = (remaining * self.args.actor_learning_rate, remaining * self.args.critic_learning_rate)
         if 0 < self.decisions <= (self.args.actor_starts or 0):
             rates = (0.0, rates[1])
-        actor, *critics = self.optimizer.param_groups
-        actor["lr"] = rates[0]
-        for critic in critics:
-            critic["lr"] = rates[1]
+        for optimizer, rate in zip((self.actor_optimizer, self.critic_optimizer), rates, strict=True):
+            for group in optimizer.param_groups:
+                group["lr"] = rate
         return rates
 
     def learned(self) -> Mapping[str, nn.Module | torch.optim.Optimizer]:
         """See :class:`Trainer`."""
-        return {"network": self.network, "optimizer": self.optimizer}
+        return {
+            "network": self.network,
+            "actor_optimizer": self.actor_optimizer,
+            "critic_optimizer": self.critic_optimizer,
+        }
 
     def policy(self) -> tuple[nn.Module, dict[str, Any]]:
         """See :class:`Trainer`."""
@@ -556,9 +591,14 @@ class OnPolicyTrainer(Trainer):
         actions = actions.cpu()
         return actions.clamp(-1.0, 1.0).numpy() if self.continuous else actions.numpy()
 
-    def _descend(self, batch: Minibatch) -> Losses:
-        loss = self.losses(batch)
-        descend(self.optimizer, self._near_teacher(loss.total, batch), self.args.max_grad_norm)
+    def _improve_policy(self, batch: Minibatch) -> PolicyLosses:
+        loss = self.policy_losses(batch)
+        descend(self.actor_optimizer, self._near_teacher(loss.total, batch), self.args.max_grad_norm)
+        return replace(loss, total=loss.total.detach())
+
+    def _improve_critics(self, batch: Minibatch) -> CriticLosses:
+        loss = self.critic_losses(batch)
+        descend(self.critic_optimizer, loss.total, self.args.max_grad_norm)
         return replace(loss, total=loss.total.detach())
 
     def _near_teacher(self, loss: Tensor, batch: Minibatch) -> Tensor:

@@ -24,10 +24,12 @@ from rl2grid.algorithms.diagnostics import explained_variance, mean
 from rl2grid.algorithms.hyperparameters import changed_preset
 from rl2grid.algorithms.on_policy import (
     ActorCritic,
-    Losses,
+    CriticLosses,
+    History,
     Minibatch,
     OnPolicyArgs,
     OnPolicyTrainer,
+    PolicyLosses,
     Rollout,
     advantages_of_rewards,
 )
@@ -137,8 +139,8 @@ def preset(name: str, *, continuous: bool, **changes: Any) -> Args:
 # --- What is optimised ----------------------------------------------------------------------------------------------
 
 
-def losses(network: ActorCritic, batch: Minibatch, args: Args) -> Losses:
-    """PPO's clipped surrogate, the critic's squared error and the entropy, to be minimised."""
+def policy_losses(network: ActorCritic, batch: Minibatch, args: Args) -> PolicyLosses:
+    """PPO's clipped surrogate and the entropy, to be minimised."""
     log_probabilities, entropies = network.log_probability_and_entropy(batch.observations, batch.actions, batch.masks)
     log_ratios = log_probabilities - batch.log_probabilities
     ratios = log_ratios.exp()
@@ -149,13 +151,18 @@ def losses(network: ActorCritic, batch: Minibatch, args: Args) -> Losses:
     clipped_ratios = ratios.clamp(1.0 - args.clip_coefficient, 1.0 + args.clip_coefficient)
     policy = -torch.minimum(advantages * ratios, advantages * clipped_ratios).mean()
 
-    value = value_loss(network.value(batch.observations), batch.values, batch.returns, args)
     entropy = entropies.mean()
-    total = policy - args.entropy_coefficient * entropy + args.value_coefficient * value
+    total = policy - args.entropy_coefficient * entropy
     with torch.no_grad():
         approximate_kl = (ratios - 1.0 - log_ratios).mean()
         clip_fraction = ((ratios - 1.0).abs() > args.clip_coefficient).float().mean()
-    return Losses(total, policy.detach(), value.detach(), entropy.detach(), approximate_kl, clip_fraction)
+    return PolicyLosses(total, policy.detach(), entropy.detach(), approximate_kl, clip_fraction)
+
+
+def critic_losses(network: ActorCritic, batch: Minibatch, args: Args) -> CriticLosses:
+    """The critic's squared error."""
+    value = value_loss(network.value(batch.observations), batch.values, batch.returns, args)
+    return CriticLosses(args.value_coefficient * value, value.detach())
 
 
 def value_loss(values: Tensor, old_values: Tensor, returns: Tensor, args: Args) -> Tensor:
@@ -181,18 +188,18 @@ class PPO(OnPolicyTrainer):
         data = self.transitions(rollout)
         history, epochs = self.improve(data, rollout.decided.flatten())
         metrics = {
-            "losses/policy_loss": mean(loss.policy for loss in history),
-            "losses/value_loss": mean(loss.value for loss in history),
-            "losses/entropy": mean(loss.entropy for loss in history),
-            "losses/approx_kl": mean(loss.approximate_kl for loss in history),
-            "losses/clipfrac": mean(loss.clip_fraction for loss in history),
+            "losses/policy_loss": mean(loss.policy for loss in history.policy),
+            "losses/value_loss": mean(loss.value for loss in history.critics),
+            "losses/entropy": mean(loss.entropy for loss in history.policy),
+            "losses/approx_kl": mean(loss.approximate_kl for loss in history.policy),
+            "losses/clipfrac": mean(loss.clip_fraction for loss in history.policy),
             "losses/explained_variance": explained_variance(data.values, data.returns),
             "charts/learning_rate": actor_learning_rate,
             "charts/update_epochs": float(epochs),
         }
         return metrics | self.further_metrics(data, history)
 
-    def further_metrics(self, data: Minibatch, history: list[Any]) -> dict[str, float]:
+    def further_metrics(self, data: Minibatch, history: History) -> dict[str, float]:
         """What else there is to tell of an update: ``history`` has the losses of every minibatch of ``data``."""
         return {}
 
@@ -209,9 +216,13 @@ class PPO(OnPolicyTrainer):
             (advantages + rollout.values).flatten(),
         )
 
-    def losses(self, batch: Minibatch) -> Losses:
-        """See :func:`losses`."""
-        return losses(self.network, batch, self.args)
+    def policy_losses(self, batch: Minibatch) -> PolicyLosses:
+        """See :func:`policy_losses`."""
+        return policy_losses(self.network, batch, self.args)
+
+    def critic_losses(self, batch: Minibatch) -> CriticLosses:
+        """See :func:`critic_losses`."""
+        return critic_losses(self.network, batch, self.args)
 
 
 ALGORITHM = Algorithm("ppo", Args, PPO, ("T", "R"), preset, load_policy, SEARCH_SPACE)

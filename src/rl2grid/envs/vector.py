@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import gymnasium
@@ -63,6 +64,8 @@ class PowerGridVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], Any, ND
         self.task = find_task(task)
         self.options = options_of(self.task, keywords, keyword_names(type(self)))
         self.num_envs = num_envs
+        self.num_threads = (num_threads or os.cpu_count() or 1) if self.options.engine == "native" else 1
+        """Threads that share the environments, as may what learns from them."""
         observations, actions = single_spaces(self.task, self.options.operator_features)
         self.single_observation_space, self.single_action_space = observations, actions
         self.observation_space = batch_space(self.single_observation_space, num_envs)
