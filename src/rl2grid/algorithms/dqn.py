@@ -45,8 +45,8 @@ from rl2grid.algorithms.off_policy import (
     random_legal_actions,
 )
 from rl2grid.algorithms.registry import Algorithm
-from rl2grid.algorithms.sampling import NEVER
 from rl2grid.algorithms.starting import StartingPolicy
+from rl2grid.dense.choices import NEVER
 from rl2grid.errors import UsageError, one_of
 
 SINGLE, DUELING = "single", "dueling"

@@ -61,9 +61,10 @@ from rl2grid.algorithms.on_policy import ActorCritic
 from rl2grid.algorithms.playing import check_environments
 from rl2grid.algorithms.registry import Algorithm
 from rl2grid.algorithms.sac import CategoricalActor, GaussianActor
-from rl2grid.algorithms.sampling import NEVER, legal_log_softmax
+from rl2grid.algorithms.sampling import legal_log_softmax
 from rl2grid.algorithms.trainer import Learner
 from rl2grid.arrays import F32, I64, Flags
+from rl2grid.dense.choices import NEVER
 from rl2grid.envs.options import DEFAULTS, OBSERVED_WITH
 from rl2grid.envs.spec import Spec, spec_of
 from rl2grid.envs.tasks import find_task

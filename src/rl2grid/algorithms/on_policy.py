@@ -33,7 +33,8 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Self
+from functools import partial
+from typing import Any, NamedTuple, Self, TypeVar
 
 import numpy as np
 import torch
@@ -46,7 +47,7 @@ from rl2grid.algorithms.diagnostics import mean
 from rl2grid.algorithms.networks import PER_ACTION, VALUE, NetworkFactory, orthogonal
 from rl2grid.algorithms.pair import Pair
 from rl2grid.algorithms.playing import Tally
-from rl2grid.algorithms.sampling import drawn, legal_log_softmax
+from rl2grid.algorithms.sampling import drawn, legal_log_softmax, log_probabilities_and_entropies
 from rl2grid.algorithms.starting import StartingPolicy
 from rl2grid.algorithms.teacher import TeacherArgs, divergences
 from rl2grid.algorithms.trainer import Played, Trainer
@@ -184,9 +185,7 @@ class ActorCritic(nn.Module):
         if self.continuous:
             entropy = (self.log_std + 0.5 * math.log(2 * math.pi * math.e)).sum()
             return self._log_densities(output, actions), entropy.expand(len(actions))
-        log_probabilities = legal_log_softmax(output, masks)
-        entropies = -(log_probabilities.exp() * log_probabilities).sum(dim=-1)
-        return log_probabilities.gather(-1, actions.unsqueeze(-1)).squeeze(-1), entropies
+        return log_probabilities_and_entropies(output, masks, actions)
 
     def _log_densities(self, means: Tensor, actions: Tensor) -> Tensor:
         """Of continuous actions [batch, dimensions], [batch]."""
@@ -362,11 +361,18 @@ class CriticLosses:
     value: Tensor
 
 
+Loss = TypeVar("Loss")
+
+
 class History(NamedTuple):
     """The losses of every minibatch of an update."""
 
     policy: list[PolicyLosses]
     critics: list[Any]
+
+
+def _each(improve: Callable[[Minibatch], Loss], batches: Sequence[Minibatch]) -> list[Loss]:
+    return [improve(batch) for batch in batches]
 
 
 class OnPolicyTrainer(Trainer):
@@ -552,8 +558,7 @@ class OnPolicyTrainer(Trainer):
             order = rows[torch.randperm(len(rows), generator=self.generator).to(self.device)]
             batches = data.rows(order).split(min(args.num_minibatches, len(rows)))
             policy, critics = self._pair.run(
-                lambda batches=batches: [self._improve_policy(batch) for batch in batches],
-                lambda batches=batches: [self._improve_critics(batch) for batch in batches],
+                partial(_each, self._improve_policy, batches), partial(_each, self._improve_critics, batches)
             )
             history.policy.extend(policy)
             history.critics.extend(critics)

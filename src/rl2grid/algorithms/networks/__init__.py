@@ -23,8 +23,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from rl2grid.algorithms.sampling import NEVER
 from rl2grid.arrays import I64
+from rl2grid.dense.choices import NEVER
 from rl2grid.envs.spec import JointActions, Spec, spec_from_state
 from rl2grid.errors import UsageError, one_of
 from rl2grid.grids.rankings import ranking

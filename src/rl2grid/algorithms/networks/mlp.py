@@ -37,7 +37,7 @@ class Layers(nn.Sequential):
     def forward(self, inputs: Tensor) -> Tensor:
         """Numbers [..., inputs] -> [..., width]."""
         if not self._linear or inputs.device.type != "cpu" or inputs.dtype != torch.float32:
-            outputs: Tensor = super().forward(inputs)
+            outputs: Tensor = super().forward(inputs)  # type: ignore[no-untyped-call]
             return outputs
         weights = [weight for layer in self._linear for weight in (layer.weight, layer.bias)]
         if torch.is_grad_enabled():
