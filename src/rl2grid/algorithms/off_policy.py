@@ -27,7 +27,8 @@ Randomness
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -101,6 +102,19 @@ class TwinCritics(nn.Module):
         """The first critic's values [batch]."""
         values: Tensor = self.networks[0](torch.cat([observations, actions], dim=-1))
         return values.squeeze(-1)
+
+
+@contextmanager
+def held(network: nn.Module) -> Iterator[None]:
+    """What is computed within it takes the network's weights as given: their gradients are not computed either."""
+    weights = list(network.parameters())
+    for weight in weights:
+        weight.requires_grad_(False)
+    try:
+        yield
+    finally:
+        for weight in weights:
+            weight.requires_grad_()
 
 
 def follow(target: nn.Module, online: nn.Module, tau: float) -> None:

@@ -53,6 +53,7 @@ from rl2grid.algorithms.off_policy import (
     TwinCritics,
     adam,
     follow,
+    held,
     random_legal_actions,
 )
 from rl2grid.algorithms.registry import Algorithm
@@ -322,7 +323,8 @@ class ContinuousObjective:
     def policy_loss(self, batch: Batch, alpha: Tensor, noise: Tensor) -> PolicyLoss:
         """The policy's loss at s_k."""
         actions, log_densities = self.actor.sample(batch.observations, noise)
-        values = self.critics(batch.observations, actions).amin(dim=0)
+        with held(self.critics):
+            values = self.critics(batch.observations, actions).amin(dim=0)
         return PolicyLoss((alpha * log_densities - values).mean(), -log_densities.detach())
 
 

@@ -36,6 +36,7 @@ from rl2grid.algorithms.off_policy import (
     TwinCritics,
     adam,
     follow,
+    held,
 )
 from rl2grid.algorithms.registry import Algorithm
 from rl2grid.errors import UsageError
@@ -237,7 +238,8 @@ class TD3(OffPolicyTrainer):
         metrics = {"losses/qf_loss": error, "losses/qf_values": values.mean()}
         if self.updates % args.policy_frequency:
             return metrics
-        actor_loss = -self.critics.first(batch.observations, self.actor(batch.observations)).mean()
+        with held(self.critics):
+            actor_loss = -self.critics.first(batch.observations, self.actor(batch.observations)).mean()
         self._descend(self.actor_optimizer, actor_loss)
         follow(self.slow_actor, self.actor, args.tau)
         follow(self.slow_critics, self.critics, args.tau)
