@@ -246,3 +246,20 @@ def test_tanh_and_its_gradient_are_those_of_pytorch():
     torch.testing.assert_close(mine, theirs, rtol=0.0, atol=1e-6)
     with torch.no_grad():
         assert torch.equal(mlp.Layers(nn.Tanh())(inputs), outputs)
+
+
+@pytest.mark.parametrize("shape", [(7, 3), (3, 7), (5, 5)])
+def test_orthogonal_weights_are_orthogonal_and_scaled(shape):
+    layer = networks.orthogonal(0.3).linear(*shape, last=False, generator=torch.Generator().manual_seed(0))
+    weight = layer.weight.detach().double()
+    product = weight @ weight.T if len(weight) <= len(weight.T) else weight.T @ weight
+    torch.testing.assert_close(product, 2.0 * torch.eye(min(shape), dtype=torch.float64), rtol=0, atol=1e-6)
+    assert float(layer.bias.detach().abs().sum()) == 0.0
+
+
+def test_orthogonal_weights_are_drawn_evenly():
+    """Without the signs of the triangular factor, the first weight of a row of two would always be negative."""
+    generator = torch.Generator().manual_seed(0)
+    style = networks.orthogonal(1.0)
+    first = torch.stack([style.linear(2, 2, last=True, generator=generator).weight[0, 0] for _ in range(400)])
+    assert abs(float((first > 0).float().mean()) - 0.5) < 0.1

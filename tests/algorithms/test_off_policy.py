@@ -21,7 +21,7 @@ from rl2grid.algorithms import dqn, sac, td3
 from rl2grid.algorithms.checkpoint import load_checkpoint, save_checkpoint
 from rl2grid.algorithms.descent import Adam
 from rl2grid.algorithms.networks import PER_ACTION
-from rl2grid.algorithms.off_policy import OffPolicyTrainer, follow, random_legal_actions
+from rl2grid.algorithms.off_policy import OffPolicyTrainer, follow, held, random_legal_actions
 from rl2grid.algorithms.policy_agent import PolicyAgent, load_agent
 from rl2grid.algorithms.replay import ReplayMemory
 from rl2grid.errors import UsageError
@@ -595,3 +595,14 @@ def test_samples_are_drawn_on_request_from_the_stream_named(kind: str):
     assert results[0] == results[1]
     assert results[0] != results[2]
     assert results[0] != results[3]
+
+
+def test_what_is_held_has_no_gradient_and_lets_others_through():
+    network = torch.nn.Linear(3, 2)
+    inputs = torch.randn(4, 3, requires_grad=True)
+    with held(network):
+        outputs = network(inputs)
+    outputs.sum().backward()  # type: ignore[no-untyped-call]
+    assert network.weight.grad is None
+    torch.testing.assert_close(inputs.grad, network.weight.detach().sum(dim=0).expand(4, 3))
+    assert all(weight.requires_grad for weight in network.parameters())

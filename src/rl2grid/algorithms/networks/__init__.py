@@ -81,10 +81,22 @@ def orthogonal(output_gain: float) -> Style:
     """Tanh and orthogonal weights; a small ``output_gain`` makes a first policy nearly indifferent."""
 
     def begin(layer: nn.Linear, last: bool, generator: torch.Generator | None) -> None:
-        nn.init.orthogonal_(layer.weight, output_gain if last else math.sqrt(2.0), generator)
+        # In float64, whose last digits, which depend on the processor, are rounded away.
+        weight = torch.empty_like(layer.weight).normal_(generator=generator).double()
+        with torch.no_grad():
+            layer.weight.copy_(_orthogonal(weight) * (output_gain if last else math.sqrt(2.0)))
         nn.init.zeros_(layer.bias)
 
     return Style(nn.Tanh, begin)
+
+
+def _orthogonal(numbers: Tensor) -> Tensor:
+    """Rows or columns, the fewer of both, made orthonormal: uniformly distributed if the numbers are normally."""
+    rows, columns = numbers.shape
+    axes, remainder = torch.linalg.qr(numbers if rows >= columns else numbers.T)
+    axes *= remainder.diagonal().sign()
+    orthonormal: Tensor = axes if rows >= columns else axes.T
+    return orthonormal
 
 
 def _uniform(layer: nn.Linear, last: bool, generator: torch.Generator | None) -> None:
