@@ -1,62 +1,91 @@
 """How fast the training loops are, and where the time goes.
 
-``python benchmarks/loop_speed.py [--seconds 20]`` runs every algorithm for a while, after a warm-up, with one thread
-for the grid and one for PyTorch, and writes ``benchmarks/results/loop_speed.json``: decisions and grid steps per
-second of processor time, and the share of the time spent in the environments.
+``python benchmarks/loop_speed.py [--seconds 8] [--only NAME ...]`` runs every algorithm for a while, after a warm-up,
+with its default hyperparameters, and writes ``benchmarks/results/loop_speed.json``. With one thread for everything:
+decisions and grid steps per second of processor time, and the share of it that the environments take. With two, for the
+environments and, in turn, for what learns: the same per second. Nothing else should run meanwhile.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import shlex
+import sys
 import time
 from pathlib import Path
 from typing import Any
 
+from gymnasium.vector import VectorEnv, VectorWrapper
+
 from rl2grid.algorithms.registry import find_algorithm
 from rl2grid.records.files import write_json
+from rl2grid.records.versions import processor
 from rl2grid.training.request import RunArgs, hyperparameters
 from rl2grid.training.runs import make_envs
 
 RESULTS = Path(__file__).resolve().parent / "results" / "loop_speed.json"
-LOOPS: tuple[tuple[str, str, str | None], ...] = (
-    ("ppo", "bus14-T0", None),
-    ("ppo", "bus14-T0", "idle"),
-    ("dqn", "bus14-T0", None),
-    ("dqn", "bus14-T0", "idle"),
-    ("sac", "bus14-T0", None),
-    ("sac", "bus14-T0", "idle"),
-    ("lagrangian-ppo", "bus14-T0-TLO", "idle"),
-    ("ppo", "bus14-R", None),
-    ("sac", "bus14-R", None),
-    ("td3", "bus14-R", None),
-    ("ppo", "bus36-MO-v0-T0", "idle"),
-    ("ppo", "bus118-M-T0", "idle"),
+LOOPS: tuple[tuple[str, str, str | None, int], ...] = (
+    ("ppo", "bus14-T0", None, 64),
+    ("ppo", "bus14-T0", None, 256),
+    ("ppo", "bus14-T0", "idle", 64),
+    ("ppo", "bus36-MO-v0-T0", "idle", 64),
+    ("ppo", "bus118-M-T0", "idle", 64),
+    ("ppo", "bus14-R", None, 64),
+    ("lagrangian-ppo", "bus14-T0-TLO", "idle", 64),
+    ("dqn", "bus14-T0", None, 64),
+    ("dqn", "bus14-T0", "idle", 64),
+    ("sac", "bus14-T0", None, 64),
+    ("sac", "bus14-T0", "idle", 64),
+    ("sac", "bus14-T0", "recovery", 64),
+    ("sac", "bus14-R", None, 64),
+    ("td3", "bus14-R", None, 64),
 )
-NUM_ENVS = 64
+"""Algorithm, task, heuristic and environments."""
 
 
-def measure(algorithm: str, task: str, heuristic: str | None, seconds: float) -> dict[str, Any]:
-    """Rates of one loop with its default hyperparameters."""
-    chosen = hyperparameters(algorithm, task, total_timesteps=100_000_000, num_envs=NUM_ENVS, **_small(algorithm))
-    envs = make_envs(RunArgs(task, chosen, algorithm, env_keywords={"heuristic": heuristic}, num_threads=1))
+class Timed(VectorWrapper[Any, Any, Any, Any, Any]):
+    """Environments that note the processor time that they take."""
+
+    def __init__(self, envs: VectorEnv[Any, Any, Any]) -> None:
+        super().__init__(envs)
+        self.seconds = 0.0
+
+    def step(self, actions: Any) -> Any:
+        """As of the environments."""
+        began = time.process_time()
+        result = self.env.step(actions)
+        self.seconds += time.process_time() - began
+        return result
+
+    def action_masks(self) -> Any:
+        """As of the environments."""
+        return self.env.action_masks()  # type: ignore[attr-defined]
+
+
+def measure(
+    algorithm: str, task: str, heuristic: str | None, num_envs: int, *, num_threads: int, seconds: float
+) -> dict[str, float]:
+    """Rates of one loop: of a second of processor time with one thread, of a second with more."""
+    chosen = hyperparameters(algorithm, task, total_timesteps=100_000_000, num_envs=num_envs, **_small(algorithm))
+    arguments = RunArgs(task, chosen, algorithm, env_keywords={"heuristic": heuristic}, num_threads=num_threads)
+    envs: Any = Timed(make_envs(arguments))
     trainer = find_algorithm(algorithm).trainer(chosen, envs)
+    trainer.iterate()
     # The off-policy algorithms play before they learn.
     while trainer.decisions <= getattr(chosen, "learning_starts", 0):
         trainer.iterate()
-    began, decisions, grid_steps = time.process_time(), trainer.decisions, trainer.grid_steps
-    shares = []
-    while time.process_time() - began < seconds:
-        iteration = time.process_time()
-        share = trainer.iterate()["charts/environment_share"]
-        shares.append((time.process_time() - iteration, share))
-    elapsed = time.process_time() - began
+    clock = time.process_time if num_threads == 1 else time.perf_counter
+    began, decisions, grid_steps, envs.seconds = clock(), trainer.decisions, trainer.grid_steps, 0.0
+    while clock() - began < seconds:
+        trainer.iterate()
+    elapsed = clock() - began
     envs.close()
-    return {
-        "num_envs": NUM_ENVS,
+    rates = {
         "decisions_per_s": round((trainer.decisions - decisions) / elapsed),
         "grid_steps_per_s": round((trainer.grid_steps - grid_steps) / elapsed),
-        "environment_share": round(sum(took * share for took, share in shares) / elapsed, 3),
     }
+    return rates | ({"environment_share": round(envs.seconds / elapsed, 3)} if num_threads == 1 else {})
 
 
 def _small(algorithm: str) -> dict[str, Any]:
@@ -65,15 +94,23 @@ def _small(algorithm: str) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seconds", type=float, default=20.0)
-    arguments = parser.parse_args()
-    results = {}
-    for algorithm, task, heuristic in LOOPS:
-        name = f"{algorithm} {task} {heuristic or 'plain'}"
-        results[name] = measure(algorithm, task, heuristic, arguments.seconds)
+    """Measure all loops, and write what came out."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("--seconds", type=float, default=8.0)
+    parser.add_argument("--only", nargs="+", default=None, help="loops, by the beginning of their names")
+    options = parser.parse_args()
+    results: dict[str, Any] = json.loads(RESULTS.read_text()) if options.only and RESULTS.exists() else {}
+    results |= {"command": shlex.join(["python", "benchmarks/loop_speed.py", *sys.argv[1:]]), "processor": processor()}
+    for algorithm, task, heuristic, num_envs in LOOPS:
+        name = f"{algorithm} {task} {heuristic or 'plain'} {num_envs}"
+        if options.only is not None and not name.startswith(tuple(options.only)):
+            continue
+        results[name] = {
+            words: measure(algorithm, task, heuristic, num_envs, num_threads=count, seconds=options.seconds)
+            for words, count in (("one thread", 1), ("two threads", 2))
+        }
         print(name, results[name], flush=True)
-    write_json(RESULTS, results, indent=1)
+        write_json(RESULTS, results, indent=1)
 
 
 if __name__ == "__main__":

@@ -60,7 +60,7 @@ def test_looking_makes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 def test_a_file_is_no_folder_that_could_be_made(tmp_path: Path):
     (tmp_path / "file").touch()
-    with pytest.raises(UsageError, match=r"cannot be made: it is a file\.$"):
+    with pytest.raises(UsageError, match=r"file is a file: give a folder\.$"):
         check_folder(tmp_path / "file")
 
 

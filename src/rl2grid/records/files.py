@@ -229,7 +229,7 @@ def check_folder(path: Path) -> None:
     # os.path: unlike Path.exists, it does not raise below a folder that may not be read.
     if os.path.exists(path):
         if not path.is_dir():
-            raise _cannot_be_made(path, "it is a file")
+            raise UsageError(f"{path} is a file: give a folder.")
         return
     above = next(parent for parent in path.absolute().parents if os.path.exists(parent))
     if not above.is_dir():
