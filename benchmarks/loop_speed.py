@@ -10,8 +10,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import shlex
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -31,6 +29,9 @@ LOOPS: tuple[tuple[str, str, str | None, int], ...] = (
     ("ppo", "bus14-T0", "idle", 64),
     ("ppo", "bus36-MO-v0-T0", "idle", 64),
     ("ppo", "bus118-M-T0", "idle", 64),
+    ("ppo", "bus14-T0", "idle", 256),
+    ("ppo", "bus36-MO-v0-T0", "idle", 256),
+    ("ppo", "bus118-M-T0", "idle", 256),
     ("ppo", "bus14-R", None, 64),
     ("lagrangian-ppo", "bus14-T0-TLO", "idle", 64),
     ("dqn", "bus14-T0", None, 64),
@@ -100,12 +101,12 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", default=None, help="loops, by the beginning of their names")
     options = parser.parse_args()
     results: dict[str, Any] = json.loads(RESULTS.read_text()) if options.only and RESULTS.exists() else {}
-    results |= {"command": shlex.join(["python", "benchmarks/loop_speed.py", *sys.argv[1:]]), "processor": processor()}
+    results["processor"] = processor()
     for algorithm, task, heuristic, num_envs in LOOPS:
         name = f"{algorithm} {task} {heuristic or 'plain'} {num_envs}"
         if options.only is not None and not name.startswith(tuple(options.only)):
             continue
-        results[name] = {
+        results[name] = {"seconds": options.seconds} | {
             words: measure(algorithm, task, heuristic, num_envs, num_threads=count, seconds=options.seconds)
             for words, count in (("one thread", 1), ("two threads", 2))
         }
