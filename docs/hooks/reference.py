@@ -12,7 +12,7 @@ from mkdocs.structure.files import File, Files
 PACKAGE = Path(__file__).resolve().parents[2] / "src" / "rl2grid"
 LAYERS = (
     "grids", "scenarios", "mdp", "engines", "envs", "records", "agents", "algorithms", "evaluation", "training",
-    "ledger", "studies", "drawing", "analysis", "powerflow", "cli",
+    "ledger", "studies", "drawing", "analysis", "powerflow", "dense", "cli",
 )  # fmt: skip
 """Packages, in the order of the menu."""
 
