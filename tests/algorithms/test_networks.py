@@ -32,6 +32,7 @@ from rl2grid.algorithms.networks import (
     network_names,
     register_network,
 )
+from rl2grid.algorithms.networks.mlp import Layers
 from rl2grid.algorithms.registry import find_algorithm
 from rl2grid.envs.registration import register_all
 from rl2grid.envs.spec import Spec, task_spec
@@ -263,3 +264,23 @@ def test_orthogonal_weights_are_drawn_evenly():
     style = networks.orthogonal(1.0)
     first = torch.stack([style.linear(2, 2, last=True, generator=generator).weight[0, 0] for _ in range(400)])
     assert abs(float((first > 0).float().mean()) - 0.5) < 0.1
+
+
+def test_layers_may_be_exchanged_and_of_other_kinds():
+    """Compiled code or not, they are what PyTorch would give."""
+    mixed = [nn.Linear(3, 4), nn.Tanh(), nn.Linear(4, 5), nn.GELU(), nn.Linear(5, 2)]
+    inputs = torch.randn(6, 3)
+    layers = Layers(*mixed)
+    torch.testing.assert_close(layers(inputs), nn.Sequential(*mixed)(inputs))
+    layers[3] = nn.ReLU()
+    layers[0] = nn.Linear(3, 4)
+    torch.testing.assert_close(layers(inputs), nn.Sequential(*layers)(inputs))
+    torch.testing.assert_close(layers(inputs.view(2, 3, 3)), layers(inputs).view(2, 3, 2))
+
+
+def test_second_derivatives_are_refused():
+    inputs = torch.randn(6, 3, requires_grad=True)
+    layers = Layers(nn.Linear(3, 4), nn.Tanh(), nn.Linear(4, 1))
+    (first,) = torch.autograd.grad(layers(inputs).sum(), inputs, create_graph=True)
+    with pytest.raises(RuntimeError, match="does not require grad"):
+        torch.autograd.grad(first.sum(), inputs)

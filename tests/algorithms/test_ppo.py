@@ -834,3 +834,10 @@ def test_a_run_begun_on_cuda_is_reproducible_and_goes_on_on_the_cpu(continuous: 
     resumed.load_state_dict(checkpoint["training"])
     resumed.iterate()
     assert load_policy(checkpoint["policy"]).actor[0].weight.device.type == "cpu"
+
+
+def test_a_checkpoint_of_an_earlier_version_is_refused_in_a_sentence():
+    state = trainer().state_dict()
+    state["optimizer"] = state.pop("actor_optimizer")
+    with pytest.raises(UsageError, match="holds no actor_optimizer: an earlier version of PPO wrote it"):
+        trainer().load_state_dict(state)

@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from rl2grid.dense.choices import (
     NEVER,
@@ -74,6 +75,7 @@ class _LogSoftmax(torch.autograd.Function):
         return log_probabilities
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> Any:
         legal, log_probabilities = ctx.saved_tensors
         of_logits = torch.empty_like(log_probabilities)
@@ -97,6 +99,7 @@ class _Choices(torch.autograd.Function):
         return chosen, entropies
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> Any:
         legal, actions, log_probabilities, entropies = ctx.saved_tensors
         of_logits = torch.empty_like(log_probabilities)

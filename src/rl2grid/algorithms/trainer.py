@@ -224,11 +224,18 @@ class Learner(ABC):
         """Go on where ``state_dict`` was called, bit for bit.
 
         Raises:
-            UsageError: what it learns from is not where it was.
+            UsageError: what it learns from is not where it was, or an earlier version kept other things.
         """
         if "start" in state:
             self.begin_with(StartingPolicy(**state["start"]))
-        for name, part in self.learned().items():
+        learned = self.learned()
+        missing = [name for name in learned if name not in state]
+        if missing:
+            raise UsageError(
+                f"The checkpoint holds no {missing[0]}: an earlier version of {self.args.algorithm} wrote it, and can "
+                "resume the run. Here its policy can be evaluated, and a new run can go on from it."
+            )
+        for name, part in learned.items():
             part.load_state_dict(state[name])
         if self.normalizer is not None:
             self.normalizer.load_state_dict(state["normalizer"])

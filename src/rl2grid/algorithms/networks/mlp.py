@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
 from rl2grid.algorithms.networks import Network, Request
 from rl2grid.dense.layers import (
@@ -20,7 +21,7 @@ from rl2grid.dense.layers import (
     write_weight_gradients,
 )
 
-_ACTIVATIONS: dict[type[nn.Module], int] = {nn.ReLU: RELU, nn.Tanh: TANH}
+_ACTIVATIONS: dict[type[Any], int] = {nn.ReLU: RELU, nn.Tanh: TANH}
 
 
 class Layers(nn.Sequential):
@@ -30,34 +31,30 @@ class Layers(nn.Sequential):
     the batch, the threads and the processor.
     """
 
-    def __init__(self, *modules: nn.Module) -> None:
-        super().__init__(*modules)
-        self._linear, self._activations = _pairs(modules)
-
     def forward(self, inputs: Tensor) -> Tensor:
         """Numbers [..., inputs] -> [..., width]."""
-        if not self._linear or inputs.device.type != "cpu" or inputs.dtype != torch.float32:
+        weights, activations = _weights_and_activations(self._modules.values())
+        if not weights or inputs.device.type != "cpu" or inputs.dtype != torch.float32:
             outputs: Tensor = super().forward(inputs)  # type: ignore[no-untyped-call]
             return outputs
-        weights = [weight for layer in self._linear for weight in (layer.weight, layer.bias)]
         if torch.is_grad_enabled():
-            return _Dense.apply(inputs, self._activations, *weights)  # type: ignore[no-untyped-call, no-any-return]
-        return _outputs(_rows(inputs), self._activations, weights)[-1].view(*inputs.shape[:-1], -1)
+            return _Dense.apply(inputs, activations, *weights)  # type: ignore[no-untyped-call, no-any-return]
+        return _outputs(_rows(inputs), activations, weights)[-1].view(*inputs.shape[:-1], -1)
 
 
-def _pairs(modules: Sequence[nn.Module]) -> tuple[tuple[nn.Linear, ...], tuple[int, ...]]:
-    """The linear layers and what activates each; none if there is anything else."""
-    linear: list[nn.Linear] = []
+def _weights_and_activations(modules: Iterable[nn.Module | None]) -> tuple[list[Tensor], list[int]]:
+    """Weight and bias of every linear layer in turn, and what activates each; none if there is anything else."""
+    weights: list[Tensor] = []
     activations: list[int] = []
     for module in modules:
         if isinstance(module, nn.Linear) and module.bias is not None:
-            linear.append(module)
+            weights += (module.weight, module.bias)
             activations.append(LINEAR)
         elif type(module) in _ACTIVATIONS and activations and activations[-1] == LINEAR:
             activations[-1] = _ACTIVATIONS[type(module)]
         else:
-            return (), ()
-    return tuple(linear), tuple(activations)
+            return [], []
+    return weights, activations
 
 
 def _rows(numbers: Tensor) -> Tensor:
@@ -80,7 +77,7 @@ class _Dense(torch.autograd.Function):
     """Layers, with their gradients."""
 
     @staticmethod
-    def forward(ctx: Any, inputs: Tensor, activations: tuple[int, ...], *weights: Tensor) -> Tensor:
+    def forward(ctx: Any, inputs: Tensor, activations: Sequence[int], *weights: Tensor) -> Tensor:
         rows = _rows(inputs)
         outputs = _outputs(rows, activations, weights)
         ctx.activations = activations
@@ -88,6 +85,7 @@ class _Dense(torch.autograd.Function):
         return outputs[-1].view(*inputs.shape[:-1], -1)
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> Any:
         n = len(ctx.activations)
         numbers, weights = ctx.saved_tensors[: n + 1], ctx.saved_tensors[n + 1 :]
