@@ -37,6 +37,8 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
     How rows are begun, stepped and observed is left to those who derive from it.
     """
 
+    num_threads = 1
+
     def __init__(self, task: Task, options: TaskOptions, n: int) -> None:
         super().__init__(task, options, n)
         self._n = n

@@ -33,7 +33,7 @@ class NativeRows(EngineRows[Commands]):
 
     def __init__(self, task: Task, options: TaskOptions, n: int, num_threads: int | None) -> None:
         super().__init__(task, options, n)
-        self._num_threads = num_threads or os.cpu_count() or 1
+        self.num_threads = num_threads or os.cpu_count() or 1
         self._injections = replace(commands_of(task.grid, [DO_NOTHING] * n), injects=np.ones(n, np.bool_))
         self._no_injection = (np.zeros(n, np.bool_), np.zeros((n, 0), np.float32))
         if self._catalogue is not None:  # numbers as the engine takes them
@@ -48,7 +48,7 @@ class NativeRows(EngineRows[Commands]):
         self._last = np.zeros((n, self._size), np.float32)
 
     def _arguments(self) -> tuple[Any, ...]:
-        return *super()._arguments(), self._num_threads
+        return *super()._arguments(), self.num_threads
 
     def _decide(self, actions: Any) -> Commands:
         if self.task.kind == "H":
@@ -60,7 +60,7 @@ class NativeRows(EngineRows[Commands]):
         return Commands(chosen, end, *self._changes, *self._no_injection)
 
     def _play(self, rows: I64, decisions: Commands) -> None:
-        self.transitions.play_rows(rows, decisions.take(rows), self._num_threads)
+        self.transitions.play_rows(rows, decisions.take(rows), self.num_threads)
 
     def _effects(self, decisions: Commands) -> NDArray[np.object_]:
         return self.transitions.action_effects_of(decisions)
@@ -73,7 +73,7 @@ class NativeRows(EngineRows[Commands]):
             np.array([position.seed for position in positions], np.int64),
             np.array([position.number for position in positions], np.int64),
             self.options.maintenance,
-            self._num_threads,
+            self.num_threads,
             self.options.episode_length or MAX_STEPS,
         )
 
@@ -96,7 +96,7 @@ class NativeRows(EngineRows[Commands]):
         for i, plan in zip(rows, plans, strict=True):
             self.transitions.engine.prepare(i, plan)
             self.transitions.action_effects[i] = ""
-        self.transitions.begin_rows(np.array(rows), self._num_threads)
+        self.transitions.begin_rows(np.array(rows), self.num_threads)
 
     def _observations(self) -> NDArray[np.float32]:
         self._buffers.reverse()

@@ -19,6 +19,8 @@ from rl2grid.envs.worker import Worker
 class RemoteRows:
     """:class:`~rl2grid.envs.rows.Rows` of which every process plays a part, all processes at once."""
 
+    num_threads = 1
+
     def __init__(self, task: Task, options: TaskOptions, n: int, num_workers: int) -> None:
         self._task, self._options, self._n = task, options, n
         self._catalogue = task_catalogue(task, task.grid)

@@ -42,6 +42,9 @@ class Rows(Protocol):
     An ended episode makes way for the next one in the same step (``AutoresetMode.SAME_STEP``).
     """
 
+    num_threads: int
+    """Threads that share them."""
+
     def reset(self, seeds: list[int | None], options: dict[str, Any] | None) -> Batch:
         """Begin an episode in every row: the first of its seed's stream; None: the next of its running stream.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from typing import Any
 
 import gymnasium
@@ -64,14 +63,14 @@ class PowerGridVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], Any, ND
         self.task = find_task(task)
         self.options = options_of(self.task, keywords, keyword_names(type(self)))
         self.num_envs = num_envs
-        self.num_threads = (num_threads or os.cpu_count() or 1) if self.options.engine == "native" else 1
-        """Threads that share the environments, as may what learns from them."""
         observations, actions = single_spaces(self.task, self.options.operator_features)
         self.single_observation_space, self.single_action_space = observations, actions
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._attributes: dict[str, tuple[Any, ...]] = {}
         self._rows = make_rows(self.task, self.options, num_envs, num_threads=num_threads, num_workers=num_workers)
+        self.num_threads = self._rows.num_threads
+        """Threads that share the environments, as may what learns from them."""
 
     def reset(  # type: ignore[override]
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
