@@ -228,14 +228,18 @@ def check_folder(path: Path) -> None:
     """
     # os.path: unlike Path.exists, it does not raise below a folder that may not be read.
     if os.path.exists(path):
-        if not path.is_dir():
-            raise UsageError(f"{path} is a file: give a folder.")
+        _refuse_file(path)
         return
     above = next(parent for parent in path.absolute().parents if os.path.exists(parent))
     if not above.is_dir():
         raise _cannot_be_made(path, f"{above} is no folder")
     if not os.access(above, os.W_OK | os.X_OK):
         raise _cannot_be_made(path, f"{above} may not be written")
+
+
+def _refuse_file(path: Path) -> None:
+    if not path.is_dir():
+        raise UsageError(f"{path} is a file: give a folder.")
 
 
 def check_own(folder: Path, marks: Sequence[str], what: str) -> None:
@@ -251,8 +255,7 @@ def check_own(folder: Path, marks: Sequence[str], what: str) -> None:
     """
     if not folder.exists():
         return
-    if not folder.is_dir():
-        raise UsageError(f"{folder} is a file: give a folder.")
+    _refuse_file(folder)
     visible = any(not path.name.startswith(".") for path in folder.iterdir())
     if visible and not any((folder / mark).exists() for mark in marks):
         raise UsageError(
