@@ -1,5 +1,5 @@
-"""Layers of small networks in compiled code: the same bits on every processor, whatever the batch and the threads.
+"""What small networks compute, in compiled code: the same bits on every processor, whatever the batch and the threads.
 
 :mod:`rl2grid.dense.tiles` multiplies a tile of two matrices in registers, :mod:`rl2grid.dense.layers` computes layers
-and their gradients with it.
+and their gradients with it, :mod:`rl2grid.dense.choices` probabilities of actions.
 """

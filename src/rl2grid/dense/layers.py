@@ -60,8 +60,7 @@ def write_weight_gradients(gradients: F32, inputs: F32, weight: F32, bias: F32) 
                 n = min(ROWS, n_outputs - row)
                 write_tile(n, gradients, first * n_outputs + row, 1, n_outputs, panel, n_terms, tile)
                 _add_tile(tile, n, weight, row, column)
-    for output in range(n_outputs):
-        bias[output] = 0.0
+    bias[:] = 0.0
     for row in range(n_rows):
         for output in range(n_outputs):
             bias[output] += gradients[row, output]
