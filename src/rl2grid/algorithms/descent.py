@@ -3,10 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+
+from rl2grid.dense import adam
+
+
+@dataclass(frozen=True)
+class FlatGroup:
+    """The weights of a parameter group and their moments, each in one array, one weight after the other."""
+
+    weights: Tensor
+    gradients: Tensor
+    means: Tensor
+    squares: Tensor
+    _steps: list[Tensor]
+
+    def descend(self, options: dict[str, Any], max_norm: float) -> None:
+        """One step down ``gradients``, which are scaled down to ``max_norm`` when longer, in compiled code."""
+        gradients = self.gradients.numpy()
+        adam.shorten(gradients, max_norm)
+        torch._foreach_add_(self._steps, 1)
+        weights, means, squares = (array.numpy() for array in (self.weights, self.means, self.squares))
+        adam.step(weights, gradients, means, squares, int(self._steps[0]), options["lr"], options["eps"])
 
 
 class _Group(NamedTuple):
@@ -26,6 +48,7 @@ class Adam(torch.optim.Adam):
         """See :class:`torch.optim.Adam`."""
         super().__init__(parameters, lr=lr, eps=eps, fused=True)
         self._groups: list[_Group] = []
+        self._flat: dict[int, FlatGroup] = {}
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
@@ -59,6 +82,36 @@ class Adam(torch.optim.Adam):
         """See :class:`torch.optim.Adam`; the moments are other tensors then."""
         super().load_state_dict(state_dict)
         self._groups = []
+        self._flat = {}
+
+    @torch.no_grad()
+    def flat(self, index: int) -> FlatGroup:
+        """The weights of group ``index``, float32 on a processor, and their moments, laid out one after the other.
+
+        The first call moves them there; those that see the weights go on to see them.
+        """
+        if index not in self._flat:
+            self._flat[index] = self._laid_out(self.param_groups[index]["params"])
+            self._groups = []
+        return self._flat[index]
+
+    def _laid_out(self, weights: list[Tensor]) -> FlatGroup:
+        for weight in weights:
+            if not self.state[weight]:
+                zeros = {name: torch.zeros_like(weight) for name in ("exp_avg", "exp_avg_sq")}
+                self.state[weight] = {"step": torch.zeros((), dtype=torch.float32), **zeros}
+        states = [self.state[weight] for weight in weights]
+        numbers = torch.cat([weight.detach().flatten() for weight in weights])
+        means, squares = (torch.cat([state[name].flatten() for state in states]) for name in ("exp_avg", "exp_avg_sq"))
+        gradients = torch.zeros_like(numbers)
+        first = 0
+        for weight, state in zip(weights, states, strict=True):
+            end = first + weight.numel()
+            weight.data = numbers[first:end].view_as(weight)
+            weight.grad = gradients[first:end].view_as(weight)
+            state["exp_avg"], state["exp_avg_sq"] = (array[first:end].view_as(weight) for array in (means, squares))
+            first = end
+        return FlatGroup(numbers, gradients, means, squares, [state["step"] for state in states])
 
     def _complete(self) -> bool:
         """Whether all weights have a gradient, as is usual."""

@@ -318,6 +318,18 @@ class LagrangianPPO(ppo.PPO):
         assert isinstance(batch, Minibatch)
         return critic_losses(self.network, batch, self.args)
 
+    def improve_critics(self, data: on_policy.Minibatch, rows: Tensor) -> on_policy.CriticLosses:
+        """One step down :func:`critic_losses`, in compiled code where there is such."""
+        steps = self.compiled_critics()
+        if steps is None:
+            return super().improve_critics(data, rows)
+        assert isinstance(data, Minibatch)
+        of_rewards, *of_costs = steps
+        value = of_rewards.step(rows, data.observations, data.values, data.returns)
+        columns = zip(of_costs, data.cost_values.T.contiguous(), data.cost_returns.T.contiguous(), strict=True)
+        cost_values = torch.stack([steps.step(rows, data.observations, *column) for steps, *column in columns])
+        return CriticLosses(self.args.value_coefficient * (value + cost_values.sum()), value, cost_values)
+
     def state_dict(self) -> dict[str, Any]:
         """See :class:`Trainer`."""
         return {

@@ -332,13 +332,6 @@ class Minibatch:
         }
         return type(self)(**columns)
 
-    def split(self, n: int) -> list[Self]:
-        """``n`` parts, alike in size to one row."""
-        columns: dict[str, Any] = {
-            name: [None] * n if array is None else array.tensor_split(n) for name, array in vars(self).items()
-        }
-        return [type(self)(**{name: parts[k] for name, parts in columns.items()}) for k in range(n)]
-
 
 @dataclass(frozen=True)
 class PolicyLosses:
@@ -371,8 +364,8 @@ class History(NamedTuple):
     critics: list[Any]
 
 
-def _each(improve: Callable[[Minibatch], Loss], batches: Sequence[Minibatch]) -> list[Loss]:
-    return [improve(batch) for batch in batches]
+def _each(improve: Callable[[Any, Tensor], Loss], data: Minibatch, batches: Sequence[Tensor]) -> list[Loss]:
+    return [improve(data, rows) for rows in batches]
 
 
 class OnPolicyTrainer(Trainer):
@@ -439,7 +432,7 @@ class OnPolicyTrainer(Trainer):
 
     @abstractmethod
     def policy_losses(self, batch: Any) -> PolicyLosses:
-        """What the policy minimises on a minibatch; called in a thread beside :meth:`critic_losses`."""
+        """What the policy minimises on a minibatch."""
 
     @abstractmethod
     def critic_losses(self, batch: Any) -> CriticLosses:
@@ -556,9 +549,9 @@ class OnPolicyTrainer(Trainer):
         epochs = 0
         for _ in range(args.update_epochs if len(rows) else 0):
             order = rows[torch.randperm(len(rows), generator=self.generator).to(self.device)]
-            batches = data.rows(order).split(min(args.num_minibatches, len(rows)))
+            batches = order.tensor_split(min(args.num_minibatches, len(rows)))
             policy, critics = self._pair.run(
-                partial(_each, self._improve_policy, batches), partial(_each, self._improve_critics, batches)
+                partial(_each, self.improve_policy, data, batches), partial(_each, self.improve_critics, data, batches)
             )
             history.policy.extend(policy)
             history.critics.extend(critics)
@@ -596,13 +589,16 @@ class OnPolicyTrainer(Trainer):
         actions = actions.cpu()
         return actions.clamp(-1.0, 1.0).numpy() if self.continuous else actions.numpy()
 
-    def _improve_policy(self, batch: Minibatch) -> PolicyLosses:
+    def improve_policy(self, data: Any, rows: Tensor) -> PolicyLosses:
+        """One step of the policy on the transitions ``rows``; called in a thread beside :meth:`improve_critics`."""
+        batch = data.rows(rows)
         loss = self.policy_losses(batch)
         descend(self.actor_optimizer, self._near_teacher(loss.total, batch), self.args.max_grad_norm)
         return replace(loss, total=loss.total.detach())
 
-    def _improve_critics(self, batch: Minibatch) -> CriticLosses:
-        loss = self.critic_losses(batch)
+    def improve_critics(self, data: Any, rows: Tensor) -> CriticLosses:
+        """One step of the critics on the transitions ``rows``."""
+        loss = self.critic_losses(data.rows(rows))
         descend(self.critic_optimizer, loss.total, self.args.max_grad_norm)
         return replace(loss, total=loss.total.detach())
 

@@ -18,8 +18,10 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
+from gymnasium.vector import VectorEnv
 from torch import Tensor
 
+from rl2grid.algorithms.compiled_steps import PolicySteps, ValueSteps, policy_steps, value_steps
 from rl2grid.algorithms.diagnostics import explained_variance, mean
 from rl2grid.algorithms.hyperparameters import changed_preset
 from rl2grid.algorithms.on_policy import (
@@ -181,6 +183,17 @@ class PPO(OnPolicyTrainer):
     """One training run; see :class:`OnPolicyTrainer`."""
 
     args: Args
+    _policy_steps: PolicySteps | None = None
+    _value_steps: list[ValueSteps] | None = None
+
+    def __init__(self, args: Args, envs: VectorEnv[Any, Any, Any], *, n_costs: int = 0) -> None:
+        """See :class:`OnPolicyTrainer`."""
+        super().__init__(args, envs, n_costs=n_costs)
+        # Compiled steps minimise what is defined beside them, and not what a subclass makes of it.
+        if _have_one_home(type(self), "policy_losses", "improve_policy"):
+            self._policy_steps = policy_steps(self.network, self.actor_optimizer, args)
+        if _have_one_home(type(self), "critic_losses", "improve_critics"):
+            self._value_steps = value_steps(self.network, self.critic_optimizer, args)
 
     def update(self, rollout: Rollout) -> dict[str, float]:
         """Improve the networks on a rollout; transitions that no decision began are left out."""
@@ -220,9 +233,36 @@ class PPO(OnPolicyTrainer):
         """See :func:`policy_losses`."""
         return policy_losses(self.network, batch, self.args)
 
+    def improve_policy(self, data: Minibatch, rows: Tensor) -> PolicyLosses:
+        """One step down :func:`policy_losses`, in compiled code where there is such."""
+        steps = self._policy_steps
+        if steps is None or steps.policy.optimizer is not self.actor_optimizer or self.teacher_coefficient:
+            return super().improve_policy(data, rows)
+        policy, entropy, approximate_kl, clip_fraction = steps.step(data, rows)
+        total = policy - self.args.entropy_coefficient * entropy
+        return PolicyLosses(total, policy, entropy, approximate_kl, clip_fraction)
+
     def critic_losses(self, batch: Minibatch) -> CriticLosses:
         """See :func:`critic_losses`."""
         return critic_losses(self.network, batch, self.args)
+
+    def improve_critics(self, data: Minibatch, rows: Tensor) -> CriticLosses:
+        """One step down :func:`critic_losses`, in compiled code where there is such."""
+        steps = self.compiled_critics()
+        if steps is None:
+            return super().improve_critics(data, rows)
+        value = steps[0].step(rows, data.observations, data.values, data.returns)
+        return CriticLosses(self.args.value_coefficient * value, value)
+
+    def compiled_critics(self) -> list[ValueSteps] | None:
+        """Steps of the critic and of the costs' critics in compiled code, where there are such for the optimiser."""
+        steps = self._value_steps
+        return None if steps is None or steps[0].critic.optimizer is not self.critic_optimizer else steps
+
+
+def _have_one_home(kind: type, *names: str) -> bool:
+    """Whether a class has these methods from one and the same of its bases."""
+    return len({next(base for base in kind.__mro__ if name in vars(base)) for name in names}) == 1
 
 
 ALGORITHM = Algorithm("ppo", Args, PPO, ("T", "R"), preset, load_policy, SEARCH_SPACE)

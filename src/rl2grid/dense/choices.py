@@ -45,7 +45,7 @@ def write_log_softmax_gradients(gradients: F32, legal: Flags, log_probabilities:
             total += gradients[row, action]
         whole = np.float32(total)
         for action in range(n_actions):
-            gradient = gradients[row, action] - _exp(log_probabilities[row, action]) * whole
+            gradient = gradients[row, action] - exponential(log_probabilities[row, action]) * whole
             logits[row, action] = gradient if legal[row, action] else np.float32(0.0)
 
 
@@ -67,7 +67,7 @@ def write_choices(logits: F32, legal: Flags, actions: I64, log_probabilities: F3
         own = log_probabilities[row]
         _write_row(logits[row], legal[row], own, powers)
         for action in range(n_actions):
-            powers[action] = _exp(own[action]) * own[action]
+            powers[action] = exponential(own[action]) * own[action]
         entropy = 0.0
         for action in range(n_actions):
             entropy -= powers[action]
@@ -84,7 +84,7 @@ def write_choice_gradients(
     for row in range(n_rows):
         own, entropy, first, second = log_probabilities[row], entropies[row], of_chosen[row], of_entropies[row]
         for action in range(n_actions):
-            gradient = -_exp(own[action]) * (first + second * (own[action] + entropy))
+            gradient = -exponential(own[action]) * (first + second * (own[action] + entropy))
             logits[row, action] = gradient if legal[row, action] else np.float32(0.0)
         logits[row, actions[row]] += first
 
@@ -99,7 +99,7 @@ def _write_row(logits: F32, legal: Flags, log_probabilities: F32, powers: F32) -
         largest = max(largest, logit)
     for action in range(logits.shape[0]):
         log_probabilities[action] -= largest
-        powers[action] = _exp(log_probabilities[action])
+        powers[action] = exponential(log_probabilities[action])
     total = 0.0
     for action in range(logits.shape[0]):
         total += powers[action]
@@ -109,8 +109,8 @@ def _write_row(logits: F32, legal: Flags, log_probabilities: F32, powers: F32) -
 
 
 @borrowing_jit
-def _exp(x: np.float32) -> np.float32:
-    """The exponential of what is not positive, within 2e-7 of its value; 0 below -87."""
+def exponential(x: np.float32) -> np.float32:
+    """The exponential of what is at most 80, within 2e-7 of its value; 0 below -87."""
     whole = (max(x, _LEAST) * _LOG2_E + _ROUND) - _ROUND
     rest = (max(x, _LEAST) - whole * _LOG_2_HIGH) - whole * _LOG_2_LOW
     power = np.float32(1.0 / 5040.0)

@@ -14,7 +14,7 @@ from rl2grid.dense.tiles import COLUMNS, ROWS, write_tile
 
 LINEAR, RELU, TANH = 0, 1, 2
 """Activations."""
-_TERMS = 256
+TERMS = 256
 """Rows of a batch whose products are added up at once: so many rows of a panel are at hand in the nearest cache."""
 _LARGEST = np.float32(8.0)
 """From here on the quotient below stays what the hyperbolic tangent is here, 1 - 1.2e-7."""
@@ -48,19 +48,28 @@ def write_weight_gradients(gradients: F32, inputs: F32, weight: F32, bias: F32) 
         weight: [output, input] is written.
         bias: [output] is written.
     """
+    weight[:] = 0.0
+    bias[:] = 0.0
+    add_weight_gradients(gradients, inputs, weight, bias)
+
+
+@jit
+def add_weight_gradients(gradients: F32, inputs: F32, weight: F32, bias: F32) -> None:
+    """Add to the gradients of a layer's weights; arguments as of :func:`write_weight_gradients`.
+
+    A batch added at once and in parts of :data:`TERMS` rows, the last of which may have less, give the same bits.
+    """
     n_rows, n_inputs = inputs.shape
     n_outputs = gradients.shape[1]
-    panel, tile = np.empty((min(n_rows, _TERMS), COLUMNS), np.float32), np.empty((ROWS, COLUMNS), np.float32)
-    weight[:] = 0.0
-    for first in range(0, n_rows, _TERMS):
-        n_terms = min(_TERMS, n_rows - first)
+    panel, tile = np.empty((min(n_rows, TERMS), COLUMNS), np.float32), np.empty((ROWS, COLUMNS), np.float32)
+    for first in range(0, n_rows, TERMS):
+        n_terms = min(TERMS, n_rows - first)
         for column in range(0, n_inputs, COLUMNS):
             _copy_columns(inputs[first : first + n_terms], column, panel)
             for row in range(0, n_outputs, ROWS):
                 n = min(ROWS, n_outputs - row)
                 write_tile(n, gradients, first * n_outputs + row, 1, n_outputs, panel, n_terms, tile)
                 _add_tile(tile, n, weight, row, column)
-    bias[:] = 0.0
     for row in range(n_rows):
         for output in range(n_outputs):
             bias[output] += gradients[row, output]

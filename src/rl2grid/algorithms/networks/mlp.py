@@ -6,11 +6,13 @@ import itertools
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from rl2grid.algorithms.networks import Network, Request
+from rl2grid.arrays import I64
 from rl2grid.dense.layers import (
     LINEAR,
     RELU,
@@ -40,6 +42,20 @@ class Layers(nn.Sequential):
         if torch.is_grad_enabled():
             return _Dense.apply(inputs, activations, *weights)  # type: ignore[no-untyped-call, no-any-return]
         return _outputs(_rows(inputs), activations, weights)[-1].view(*inputs.shape[:-1], -1)
+
+
+def shape_of(network: nn.Module) -> tuple[I64, I64] | None:
+    """Widths [layer + 1] and activations [layer] of a network that compiled code knows as a whole; None of any other.
+
+    It knows those whose parameters are the weights and biases of :class:`Layers`, on a processor.
+    """
+    if not isinstance(network, Layers):
+        return None
+    weights, activations = _weights_and_activations(network._modules.values())
+    if not weights or any(weight.device.type != "cpu" or weight.dtype != torch.float32 for weight in weights):
+        return None
+    widths = [weights[0].shape[1], *(len(weight) for weight in weights[::2])]
+    return np.array(widths, np.int64), np.array(activations, np.int64)
 
 
 def _weights_and_activations(modules: Iterable[nn.Module | None]) -> tuple[list[Tensor], list[int]]:
