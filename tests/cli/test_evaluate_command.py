@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from sample_results import result
+from sample_results import result, with_foresight
 
 from rl2grid.cli import evaluate as command
 from rl2grid.cli.main import main
@@ -39,6 +39,26 @@ def test_agents_are_compared_with_the_first_on_the_same_months(played, capsys):
     assert "+0.433" in shown
     assert "Holm's correction over these 2 comparisons" in " ".join(shown.split())
     assert "outside of a ledger" not in shown
+
+
+def test_who_knows_the_future_is_marked_and_neither_best_nor_compared(monkeypatch, capsys):
+    survivals = {**SURVIVALS, "foresight": [[1.0], [0.9], [1.0]]}
+
+    def evaluate(agent: str, task: Any, **options: Any):
+        made = replace(result(agent, survivals[agent], split=options["split"]), folder=options["output"])
+        return with_foresight(made) if agent == "foresight" else made
+
+    monkeypatch.setattr(command, "evaluate", evaluate)
+    words = ["evaluate", "foresight", "do-nothing", "greedy", "bus14-T0", "--months", "3"]
+    assert main(words) == 0
+    shown = capsys.readouterr().out
+    assert "foresight (with foresight)" in " ".join(shown.split())
+    assert "survival, to do-nothing" in shown
+    assert "+0.433" in shown
+    assert "survival, to foresight" not in shown
+    assert main([*words, "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert [one["foresight"] for one in printed["summaries"]] == [True, False, False]
 
 
 def test_one_agent_is_not_compared_and_a_look_at_test_months_is_told(capsys):

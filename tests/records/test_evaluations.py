@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 from sample_folders import write_made_up_evaluation
-from sample_results import episode, result
+from sample_results import episode, result, with_foresight
 
 from rl2grid.analysis.summary_table import HEADINGS, markdown_table, summary_table
 from rl2grid.analysis.table import result_table_rich
@@ -111,6 +111,17 @@ def test_summaries_of_a_mixture_are_refused():
 def test_values_are_ordered_by_scenario_and_seed():
     rows = [episode("b", 1, 0.4), episode("a", 1, 0.2), episode("b", 0, 0.3), episode("a", 0, 0.1)]
     np.testing.assert_array_equal(by_scenario(rows, "survival"), [[0.1, 0.2], [0.3, 0.4]])
+
+
+def test_who_knows_the_future_is_marked_and_never_the_best():
+    bound = with_foresight(result("foresight", [[1.0, 1.0]])).summary
+    greedy, nothing = result("greedy", [[0.9, 0.4]]).summary, result("do-nothing", [[0.5, 0.1]]).summary
+    marked, best, other = markdown_table([bound, greedy, nothing]).splitlines()[2:]
+    assert "foresight (with foresight)" in marked
+    assert "**" not in marked
+    assert "**0.650 [" in best
+    assert "**" not in other
+    assert "**" not in markdown_table([bound, greedy])
 
 
 def test_tables_name_the_best():

@@ -41,7 +41,7 @@ LEGEND = (
 def table_cells(summary: Summary) -> list[str]:
     """The cells of one agent, under :data:`HEADINGS`."""
     return [
-        summary.agent,
+        _with_mark(summary.agent, summary),
         summary.heuristic,
         str(summary.episodes),
         with_interval(summary.survival, 3),
@@ -87,8 +87,9 @@ def summary_table(summaries: Sequence[Summary]) -> ResultTable:
 
 
 def agent_words(summary: Summary) -> str:
-    """The agent with the heuristic that it played with, as "PPO + idle"."""
-    return summary.agent if summary.heuristic == "none" else f"{summary.agent} + {summary.heuristic}"
+    """The agent with the heuristic that it played with, as "PPO + idle", and whether it knew the future."""
+    words = summary.agent if summary.heuristic == "none" else f"{summary.agent} + {summary.heuristic}"
+    return _with_mark(words, summary)
 
 
 def markdown_table(summaries: Sequence[Summary]) -> str:
@@ -104,8 +105,16 @@ def markdown_table(summaries: Sequence[Summary]) -> str:
 
 
 def is_best(summary: Summary, summaries: Sequence[Summary]) -> bool:
-    """Whether no other agent survives longer on average; of one agent alone, nobody is best."""
-    return len(summaries) > 1 and summary.survival.value == max(other.survival.value for other in summaries)
+    """Whether no other agent survives longer on average; of one agent alone, nobody is best.
+
+    Who knows the future is not ranked: what it survives is a bound.
+    """
+    ranked = [other.survival.value for other in summaries if not other.foresight]
+    return not summary.foresight and len(ranked) > 1 and summary.survival.value == max(ranked)
+
+
+def _with_mark(words: str, summary: Summary) -> str:
+    return f"{words} (with foresight)" if summary.foresight else words
 
 
 def _number(estimate: Estimate) -> str:

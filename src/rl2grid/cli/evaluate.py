@@ -73,7 +73,7 @@ def _run(options: argparse.Namespace, output: Output) -> int:
     made = [_made(agent, task, options) for agent in agents]
     results = [_evaluated(agent, one, task, options, output) for agent, one in zip(agents, made, strict=True)]
     summaries = [result.summary for result in results]
-    records = [asdict(result.summary) | {"foresight": result.foresight, "folder": result.folder} for result in results]
+    records = [asdict(result.summary) | {"folder": result.folder} for result in results]
     length = results[0].identity.get("episode_length")
     of_length = "" if length is None else f", episodes of {length} steps"
     output.table(summary_table(summaries), records, title=f"{task.id}, {options.split} scenarios{of_length}")
@@ -85,8 +85,9 @@ def _run(options: argparse.Namespace, output: Output) -> int:
     if options.l2rpn:
         table = scored_table([Method((result,)) for result in results], output)
         output.table(table, table_records(table), title="Scores of the L2RPN competitions")
-    if len(results) > 1:
-        _compare(results, output)
+    ranked = [result for result in results if not result.foresight]
+    if len(ranked) > 1:
+        _compare(ranked, output)
     if options.split == TEST:
         output.remark(
             "These test months were looked at outside of a ledger, which counts looks: 'rl2grid leaderboard test'."

@@ -66,6 +66,8 @@ class Summary:
     """Episodes per reason, completed ones left out."""
     wall_time_s: float
     """Sum over episodes."""
+    foresight: bool
+    """Whether the agent knew in some episode what no operator knows: the true future."""
 
 
 def summarise(episodes: Sequence[Episode]) -> Summary:
@@ -106,6 +108,7 @@ def summarise(episodes: Sequence[Episode]) -> Summary:
         grid_steps=of("grid_steps"),
         game_over=dict(sorted(reasons.items())),
         wall_time_s=sum(episode.wall_time_s for episode in episodes),
+        foresight=any(episode.foresight for episode in episodes),
     )
 
 
