@@ -75,6 +75,8 @@ def test_tasks_with_injections_and_nonsense_are_refused():
 def test_who_knows_the_future_has_no_test(monkeypatch):
     monkeypatch.setattr(subjects, "evaluate", lambda agent, task, **_: evaluate(
         foresight(), task, split="bundled", scenarios=[MONTH], episode_length=100))  # fmt: skip
-    subject = subjects.find_subject("foresight@bus14-T0", months=1)
+    with pytest.raises(UsageError, match="knows the future: it is not ranked"):
+        subjects.find_subject("foresight@bus14-T0", months=1)
+    subject = subjects.find_subject("greedy@bus14-T0", months=1)  # another whose months show that it knew
     with pytest.raises(UsageError, match="who knows the future is not ranked"):
         subjects.play_test(subject)

@@ -76,6 +76,8 @@ def test_one_agent_is_not_compared_and_a_look_at_test_months_is_told(capsys):
         (["greedy", "nobody"], "Agent 'nobody'"),
         (["greedy", "--seconds", "1"], "--seconds is for the agent planner"),
         (["planner", "--seconds", "0"], "seconds=0.0 is not allowed"),
+        (["do-nothing", "dc-opf"], "Agent 'dc-opf' cannot play"),
+        (["do-nothing", "planner", "--engine", "reference"], "asks what-ifs of the native engine"),
     ],
 )
 def test_what_cannot_be_played_is_refused_before_anything_is(played, capsys, words, sentence):

@@ -4,6 +4,7 @@ import pytest
 from PIL import Image
 
 from rl2grid.cli.main import main
+from rl2grid.evaluation import watching
 
 
 def test_an_episode_is_written_as_page_and_animation(capsys, tmp_path):
@@ -35,7 +36,7 @@ def test_others_play_the_same_month_on_the_same_page(capsys, tmp_path):
     [
         (["genius", "bus14-T0"], "choose one of do-nothing"),
         (["do-nothing", "bus14-T0", "--against", "genius"], "choose one of do-nothing"),
-        (["do-nothing", "bus14-T0", "--against", "dc-opf"], "dc-opf"),
+        (["do-nothing", "bus14-T0", "--against", "dc-opf"], "Agent 'dc-opf' cannot play"),
         (["do-nothing", "bus14-T0", "--steps", "0"], "steps=0 is not allowed"),
         (["do-nothing", "bus14-T0", "--every", "0"], "every=0 is not allowed"),
         (["do-nothing", "bus14-T0", "--seed", "-1"], "seed=-1 is not allowed"),
@@ -48,3 +49,8 @@ def test_bad_requests_are_refused_with_one_sentence(capsys, tmp_path, flags, wor
     (sentence,) = [line for line in capsys.readouterr().err.strip().splitlines() if line.startswith("rl2grid: ")]
     assert words in sentence
     assert not list(tmp_path.iterdir())
+
+
+def test_nobody_plays_before_all_are_known_to_be_able_to(monkeypatch, tmp_path):
+    monkeypatch.setattr(watching, "play_to_watch", lambda *_, **__: pytest.fail("played"))
+    assert main(["watch", "do-nothing", "bus14-R", "--against", "foresight", "--output", str(tmp_path / "w")]) == 2

@@ -48,8 +48,14 @@ def test_an_agent_without_training_is_named_with_its_task(played):
     assert few.digest != subject.digest
     play_test(few)
     assert played[1]["scenarios"] == played[0]["scenarios"][:3]
-    with pytest.raises(UsageError, match="Task"):
-        find_subject("random@bus15-T0")
+    for text, sentence in (
+        ("random@bus15-T0", "Task"),
+        ("nobody@bus14-T0", "Agent 'nobody'"),
+        ("random@bus14-T0:sleepy", "heuristic, 'sleepy'"),
+        ("milp@bus14-R", "cannot play a redispatching task"),
+    ):
+        with pytest.raises(UsageError, match=sentence):
+            find_subject(text)
 
 
 def test_a_run_plays_its_last_policy_beside_the_best_and_tells_of_earlier_looks(played, tmp_path: Path, monkeypatch):

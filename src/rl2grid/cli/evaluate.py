@@ -21,7 +21,7 @@ from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import make_agent
 from rl2grid.evaluation.flags import environment_flags, evaluate_command
 from rl2grid.evaluation.places import default_folder
-from rl2grid.evaluation.protocol import evaluate, first_months
+from rl2grid.evaluation.protocol import check_playable, evaluate, first_months
 from rl2grid.records.collection import LAST_POLICY
 from rl2grid.records.evaluations import Evaluation
 from rl2grid.records.methods import Method, group_methods
@@ -69,8 +69,10 @@ def _run(options: argparse.Namespace, output: Output) -> int:
         raise UsageError("An agent was named twice: name each once.")
     if options.output is not None and len(agents) > 1:
         raise UsageError("--output is the folder of one agent: leave it out, and each gets a folder of its own.")
-    # Before anything is played: one that does not exist would be found after an hour of others.
+    # Before anything is played: one that does not exist, or cannot play it, would be found after an hour of others.
     made = [_made(agent, task, options) for agent in agents]
+    for agent in agents:
+        check_playable(_made(agent, task, options), task, {**keywords.given(options), "split": options.split})
     results = [_evaluated(agent, one, task, options, output) for agent, one in zip(agents, made, strict=True)]
     summaries = [result.summary for result in results]
     records = [asdict(result.summary) | {"folder": result.folder} for result in results]

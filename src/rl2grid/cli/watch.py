@@ -84,11 +84,13 @@ def _run(options: argparse.Namespace, output: Output) -> int:
 
 
 def _check_agents(task: Task, options: argparse.Namespace) -> None:
-    """Refuse agents that are not to be had, before the first of several has played."""
+    """Refuse agents that are not to be had, or cannot play the task, before the first of several has played."""
     from rl2grid.evaluation.agents import make_agent
+    from rl2grid.evaluation.protocol import check_playable
 
+    asked = {"split": options.split, "heuristic": _heuristic(options)}
     for agent in (options.agent, *options.against):
-        make_agent(agent, task)
+        check_playable(make_agent(agent, task), task, asked)
 
 
 def _files(task: Task, recordings: Sequence[Recording], options: argparse.Namespace) -> dict[Path, list[Recording]]:
@@ -126,23 +128,28 @@ def _result(recording: Recording) -> dict[str, Any]:
 
 
 def _play(agent: str, task: Task, options: argparse.Namespace, progress: Progress) -> Recording:
-    from rl2grid.evaluation.protocol import AS_TRAINED
     from rl2grid.evaluation.watching import play_to_watch
 
     playing = progress.add_task("Playing", total=None)
-    heuristic = {None: AS_TRAINED, "None": None}.get(options.heuristic, options.heuristic)
     return play_to_watch(
         agent,
         task,
         split=options.split,
         scenario=options.scenario,
         seed=options.seed,
-        heuristic=heuristic,
+        heuristic=_heuristic(options),
         steps=options.steps,
         on_step=lambda step, length: progress.update(
             playing, completed=step, total=min(length, options.steps or length)
         ),
     )
+
+
+def _heuristic(options: argparse.Namespace) -> str | None:
+    from rl2grid.evaluation.protocol import AS_TRAINED
+
+    given: str | None = options.heuristic
+    return {None: AS_TRAINED, "None": None}.get(given, given)
 
 
 def _frame_steps(n_rows: int, every: int | None) -> Sequence[int]:

@@ -112,6 +112,21 @@ def evaluate(
     )
 
 
+def check_playable(agent: Agent, task: Task, options: Mapping[str, Any]) -> None:
+    """Bind an agent to an environment, as playing would: what it refuses is known before months are made or played.
+
+    Args:
+        agent: is bound afterwards, and not to be played.
+        task: the task.
+        options: keywords of the environment, as :func:`evaluate` takes them.
+
+    Raises:
+        UsageError: the agent cannot play the task, or not with these options.
+    """
+    keywords = env_keywords(agent, {"heuristic": AS_TRAINED, **options})
+    Setting(task.id, agent, keywords).player().close()
+
+
 def first_months(task: Task, split: str, months: int | None) -> tuple[str, ...]:
     """The first scenarios of a split, of all seasons alike; ``months`` None: all.
 

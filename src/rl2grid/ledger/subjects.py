@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from rl2grid.agents.foresight import Foresight
 from rl2grid.algorithms.pretrained import is_pretrained, pretrained
 from rl2grid.envs.tasks import Task, find_task, short_id
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import make_agent
-from rl2grid.evaluation.protocol import AS_TRAINED, evaluate, first_months
+from rl2grid.evaluation.protocol import AS_TRAINED, check_playable, evaluate, first_months
 from rl2grid.records.collection import was_evaluated
 from rl2grid.records.evaluations import Evaluation, identity_hash
 from rl2grid.records.ledger import STARTED_FROM, HashedTest, agent_of, choice_hash, hashed_test
@@ -74,8 +75,8 @@ def find_subject(text: str, months: int | None = None, top_k: int | None = None)
         top_k: of how many of a policy's best actions the what-if chooses; None: it plays its best.
 
     Raises:
-        UsageError: a run that is not finished or was never validated, no such agent, task or run, or ``top_k`` for what
-            is no policy.
+        UsageError: a run that is not finished or was never validated, no such agent, task, heuristic or run, an agent
+            that cannot play the task or knows the future, or ``top_k`` for what is no policy.
     """
     if "@" in text:
         agent, _, rest = text.partition("@")
@@ -170,6 +171,10 @@ def _learned_from(identity: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _untrained(agent: str, task: Task, heuristic: str | None, months: int | None) -> Subject:
+    made = make_agent(agent, task)
+    if isinstance(made, Foresight):
+        raise UsageError(f"Agent {agent!r} knows the future: it is not ranked, and has no test.")
+    check_playable(made, task, {"split": TEST, "heuristic": heuristic})
     configuration = {"agent": agent, "task": task.id, "heuristic": heuristic, "test": _test_of(task, months)}
     return Subject(configuration, agent, task, heuristic, {})
 
