@@ -83,6 +83,11 @@ def test_entries_are_ranked_by_survival(folder, capsys, monkeypatch):
         (["verify", "{}/random.json", "{}/random/evaluation.json"], "is no entry of a leaderboard"),
         (["table", "{}/random.json", "{}/random.json"], "was given twice"),
         (["table", "{}/random.json", "{}/two.json"], "different scenarios or seeds"),
+        (["table", "{}/random.json", "--to", "greedy"], "--to is for the rows of a --ledger"),
+        (["table", "{}/random.json", "--task", "bus14-T0"], "--task is for the rows of a --ledger"),
+        (["table", "{}/random.json", "--ledger", "{}/ledger.json"], "do not belong into one table"),
+        (["table", "--ledger", "{}/ledger.json", "--l2rpn"], "a ledger does not keep what its episodes cost"),
+        (["table", "--ledger", "{}/ledger.json"], "There is no ledger"),
     ],
 )
 def test_refusals_are_one_sentence(folder, tmp_path, capsys, words, part):

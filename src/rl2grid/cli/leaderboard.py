@@ -163,7 +163,23 @@ def _verified(found: Mapping[str, str | None], output: Output) -> int:
     return DIFFERENT if any(found.values()) else 0
 
 
+def _check_what_is_ranked(options: argparse.Namespace) -> None:
+    """Refuse files beside a ledger, and flags of the one for the other: they would be passed over in silence."""
+    if options.ledger is None:
+        for flag, value in (("--task", options.only), ("--to", options.to)):
+            if value is not None:
+                raise UsageError(f"{flag} is for the rows of a --ledger: leave it out for entries.")
+        return
+    if options.files:
+        raise UsageError("Entries and a --ledger do not belong into one table: name the one or the other.")
+    if options.l2rpn:
+        raise UsageError("--l2rpn is for entries: a ledger does not keep what its episodes cost.")
+    if not options.ledger.exists():
+        raise UsageError(f"There is no ledger {options.ledger}: give a file that 'rl2grid leaderboard test' wrote.")
+
+
 def _table(options: argparse.Namespace, output: Output) -> int:
+    _check_what_is_ranked(options)
     if options.ledger is not None:
         from rl2grid.analysis.ledger_table import ledger_table
 
