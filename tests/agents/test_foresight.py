@@ -68,8 +68,17 @@ def test_it_forgets_the_future_of_an_action_that_was_not_played():
 def test_tasks_with_injections_and_nonsense_are_refused():
     with pytest.raises(UsageError, match="has injections: choose a topology task"):
         foresight().bind(gymnasium.make("rl2grid/bus14-R-v0", split="bundled"))
-    with pytest.raises(UsageError, match="attempts=0 is not allowed"):
-        foresight(attempts=0)
+    for attempts in (0, 2.5, "many", True, None):
+        with pytest.raises(UsageError, match=r"attempts=.* is not allowed: give a whole number"):
+            foresight(attempts=attempts)
+    with pytest.raises(UsageError, match="guide='planner' is not allowed: give an agent"):
+        Foresight("planner")  # type: ignore[arg-type]
+
+
+def test_another_guide_or_another_reach_is_another_name():
+    assert Foresight().name == "foresight"
+    assert Foresight(attempts=20).name == "foresight (attempts 20)"
+    assert foresight().name == "foresight (guided by do-nothing, ahead 24, candidates 6, attempts 60)"
 
 
 def test_who_knows_the_future_has_no_test(monkeypatch):

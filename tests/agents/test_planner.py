@@ -131,6 +131,10 @@ def test_it_says_why():
 
 def test_ingredients_are_left_out_by_name():
     assert Planner(without=["danger", "sequences"]).name == "planner without danger without sequences"
+    assert Planner(without=["danger", "danger"]).name == "planner without danger"
+    for nonsense in ("sequences", None, 5):
+        with pytest.raises(UsageError, match="give a list of ingredients"):
+            Planner(without=nonsense)  # type: ignore[arg-type]
     with pytest.raises(UsageError, match=r"Ingredient 'luck'.*sequences"):
         Planner(without=["luck"])
     assert set(INGREDIENTS) == {"sequences", "danger", "restoring", "prevention", "dispatch first"}
@@ -142,6 +146,14 @@ def test_the_seconds_of_a_search_are_positive():
     assert Planner(seconds=0.5).name == "planner (0.5 s)"
     with pytest.raises(UsageError, match="seconds=0 is not allowed"):
         Planner(seconds=0)
+    for nonsense in (True, "0.1", float("inf"), float("nan"), [1.0]):
+        with pytest.raises(UsageError, match="is not allowed: give a positive number"):
+            Planner(seconds=nonsense)  # type: ignore[arg-type]
+
+
+def test_seconds_are_refused_where_nothing_is_searched():
+    with pytest.raises(UsageError, match="search for topology actions, which rl2grid/bus14-R-v0 has not"):
+        Planner(seconds=1.0).bind(environment("bus14-R"))
 
 
 def test_the_reference_engine_answers_no_what_if():

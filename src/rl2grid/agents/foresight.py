@@ -6,6 +6,7 @@ import copy
 import itertools
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
+from numbers import Integral
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -22,6 +23,8 @@ from rl2grid.mdp.state import GridState
 
 _EARLIER = (1, 3, 6, 12, 24, 48)
 """Decisions before the grid became unsafe at which something else is tried as well."""
+_AHEAD, _CANDIDATES, _ATTEMPTS = 96, 24, 300
+"""Decisions played in advance, actions tried per decision and attempts per death, unless others are asked for."""
 _PAST = 24
 """Grid steps after the moment of a death that an attempt must survive to have averted it."""
 
@@ -52,7 +55,8 @@ class Foresight:
     game over, it goes back decision by decision, first through the crisis, then to moments before it began, plays
     another action there and lets the guide go on; what outlives the moment of the death by two hours is kept. So its
     survival can be reached by one who reacts like the planner and knows all attacks, outages and demand: a lower bound
-    of the best possible. It is marked as an agent with foresight and never ranked with others.
+    of the best possible. It is marked as an agent with foresight and never ranked with others. Its name says who guides
+    it and how far it looks, where that is not as by default.
 
     Args:
         guide: who plays on, from any state and whatever was played before; None: the planner.
@@ -61,17 +65,30 @@ class Foresight:
         attempts: that are made to avert one death.
 
     Raises:
-        UsageError: one of them is less than 1.
+        UsageError: the guide is no agent, or one of the others no whole number of at least 1.
     """
 
     name = "foresight"
     kinds = ("T",)
 
-    def __init__(self, guide: Agent | None = None, ahead: int = 96, candidates: int = 24, attempts: int = 300) -> None:
-        for name, value in (("ahead", ahead), ("candidates", candidates), ("attempts", attempts)):
-            if value < 1:
-                raise UsageError(f"{name}={value} is not allowed: give a number, at least 1.")
+    def __init__(
+        self,
+        guide: Agent | None = None,
+        ahead: int = _AHEAD,
+        candidates: int = _CANDIDATES,
+        attempts: int = _ATTEMPTS,
+    ) -> None:
+        asked = {"ahead": ahead, "candidates": candidates, "attempts": attempts}
+        for name, value in asked.items():
+            if not isinstance(value, Integral) or isinstance(value, bool) or value < 1:
+                raise UsageError(f"{name}={value!r} is not allowed: give a whole number, at least 1.")
+        if not (guide is None or isinstance(guide, Agent)):
+            raise UsageError(f"guide={guide!r} is not allowed: give an agent, such as Planner(), or None.")
         self._guide = Planner() if guide is None else guide
+        usual = {"ahead": _AHEAD, "candidates": _CANDIDATES, "attempts": _ATTEMPTS}
+        guided = [] if guide is None else [f"guided by {guide.name}"]
+        details = guided + [f"{name} {value}" for name, value in asked.items() if value != usual[name]]
+        self.name = f"foresight ({', '.join(details)})" if details else "foresight"
         self._ahead, self._candidates, self._attempts = ahead, candidates, attempts
 
     def bind(self, env: gymnasium.Env[Any, Any]) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
+from numbers import Real
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -77,19 +79,21 @@ class Planner:
         seconds: that a search may take; None: as long as it takes, so that results depend on nothing but the seed.
 
     Raises:
-        UsageError: there is no such ingredient, or the seconds are not positive.
+        UsageError: there is no such ingredient, or the seconds are no positive number.
     """
 
     kinds = ("T", "R", "H")
 
     def __init__(self, without: Collection[str] = (), seconds: float | None = None) -> None:
+        if isinstance(without, str) or not isinstance(without, Collection):
+            raise UsageError(f'without={without!r} is not allowed: give a list of ingredients, such as ["danger"].')
         for each in without:
             if each not in INGREDIENTS:
                 raise one_of("Ingredient", each, INGREDIENTS)
-        if seconds is not None and not seconds > 0:
+        if seconds is not None and not _is_positive(seconds):
             raise UsageError(f"seconds={seconds!r} is not allowed: give a positive number.")
         self._without, self._seconds = frozenset(without), seconds
-        self.name = "planner" + "".join(f" without {each}" for each in sorted(without))
+        self.name = "planner" + "".join(f" without {each}" for each in sorted(self._without))
         if seconds is not None:
             self.name += f" ({seconds:g} s)"
 
@@ -97,11 +101,17 @@ class Planner:
         """Look up the grid, its actions and its electrical model.
 
         Raises:
-            UsageError: the reference engine plays, which answers no what-if.
+            UsageError: the reference engine plays, which answers no what-if, or a search is limited that the task has
+                no use for.
         """
         base: Any = env.unwrapped
         if not isinstance(base.engine, NativeEngine):
             raise UsageError("Agent 'planner' asks what-ifs of the native engine: choose engine=\"native\".")
+        if self._seconds is not None and not base.task.changes_topology:
+            raise UsageError(
+                f"The seconds of the planner end its search for topology actions, which {base.task.id} has not: leave "
+                "them out."
+            )
         self._env, self._space = base, env.action_space
         self._opened: AsOpened[GridState] = AsOpened()
         self._grid: Grid = base.grid
@@ -323,6 +333,10 @@ class Planner:
         if self._dispatch is None:
             return topology
         return injecting_action(self._space, self._held() if injection is None else injection, topology)
+
+
+def _is_positive(seconds: float) -> bool:
+    return isinstance(seconds, Real) and not isinstance(seconds, bool) and math.isfinite(seconds) and seconds > 0
 
 
 def is_at_reference(state: GridState) -> bool:
