@@ -95,6 +95,14 @@ def test_the_planner_searches_for_as_long_as_it_is_told(played, capsys):
     assert one["output"].name == "validation-1-months-0.1-seconds"
 
 
+def test_the_seconds_of_the_planner_are_not_those_of_who_plays_beside_it(played, capsys):
+    assert main(["evaluate", "greedy", "planner", "bus14-T0", "--months", "3", "--seconds", "0.1"]) == 0
+    greedy, planner = played
+    assert (greedy["agent"], planner["agent"].name) == ("greedy", "planner (0.1 s)")
+    assert (greedy["output"].name, planner["output"].name) == ("validation-3-months", "validation-3-months-0.1-seconds")
+    assert greedy["command"].endswith("--months 3")
+
+
 def test_scores_of_l2rpn_stand_in_a_table_of_their_own(monkeypatch, capsys):
     def scored(result, on_progress):
         on_progress(len(result.episodes))

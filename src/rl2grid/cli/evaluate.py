@@ -27,6 +27,8 @@ from rl2grid.records.evaluations import Evaluation
 from rl2grid.records.methods import Method, group_methods
 from rl2grid.scenarios.splits import SPLITS, TEST
 
+_PLANNER = "planner"
+
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add the flags of the command."""
@@ -69,6 +71,8 @@ def _run(options: argparse.Namespace, output: Output) -> int:
         raise UsageError("An agent was named twice: name each once.")
     if options.output is not None and len(agents) > 1:
         raise UsageError("--output is the folder of one agent: leave it out, and each gets a folder of its own.")
+    if options.seconds is not None and _PLANNER not in agents:
+        raise UsageError(f"--seconds is for the agent planner, which searches: leave it out for {', '.join(agents)}.")
     # Before anything is played: one that does not exist, or cannot play it, would be found after an hour of others.
     made = [_made(agent, task, options) for agent in agents]
     for agent in agents:
@@ -101,16 +105,14 @@ def _run(options: argparse.Namespace, output: Output) -> int:
 
 
 def _made(agent: str, task: Task, options: argparse.Namespace) -> Agent:
-    if options.seconds is None:
-        return make_agent(agent, task, top_k=options.top_k)
-    if agent != "planner":
-        raise UsageError(f"--seconds is for the agent planner, which searches: leave it out for {agent}.")
-    return Planner(seconds=options.seconds)
+    if agent == _PLANNER and options.seconds is not None:
+        return Planner(seconds=options.seconds)
+    return make_agent(agent, task, top_k=options.top_k)
 
 
-def _own_flags(options: argparse.Namespace) -> dict[str, str]:
-    """Flags that say how an agent decides, and their values."""
-    flags = {"seconds": options.seconds, "top-k": options.top_k}
+def _own_flags(agent: str, options: argparse.Namespace) -> dict[str, str]:
+    """Flags that say how this agent decides, and their values."""
+    flags = {"seconds": options.seconds if agent == _PLANNER else None, "top-k": options.top_k}
     return {name: f"{value:g}" for name, value in flags.items() if value is not None}
 
 
@@ -123,7 +125,7 @@ def _name_of_last(agent: str, made: Agent) -> str | None:
 def _evaluated(agent: str, made: Agent, task: Task, options: argparse.Namespace, output: Output) -> Evaluation:
     chosen = keywords.given(options)
     command = evaluate_command(agent, task, options.split, options.seeds, options.months, chosen)
-    own = _own_flags(options)
+    own = _own_flags(agent, options)
     return evaluate(
         made if own else agent,
         task,
@@ -158,6 +160,6 @@ def _default_output(
         parts.append(str(chosen["heuristic"]))
     if options.months is not None:
         parts.append(f"{options.months}-months")
-    parts += [f"{value}-{name}" for name, value in _own_flags(options).items()]
+    parts += [f"{value}-{name}" for name, value in _own_flags(agent, options).items()]
     parts += [flag.removeprefix("--") for flag in environment_flags({**chosen, "heuristic": None})]
     return default_folder(agent, made, task, "evaluation", "-".join(parts))
