@@ -66,6 +66,10 @@ def published_agent():
 
     vars(np).setdefault("NaN", np.nan)
     vars(gridmodel).setdefault("init", gridmodel.init_from_pandapower)  # called for other backends alone
-    from l2rpn_baselines.OptimCVXPY import OptimCVXPY as Published
+    try:
+        from l2rpn_baselines.OptimCVXPY import OptimCVXPY as Published
+    except ImportError as error:
+        words = f"OptimCVXPY needs l2rpn-baselines, in an environment of its own ({error}): see docs/l2rpn.md."
+        raise UsageError(words) from None
 
     return Published

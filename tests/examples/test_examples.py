@@ -99,6 +99,13 @@ def test_an_agent_in_a_file_is_played(monkeypatch, capsys, tmp_path):
     assert summary["survival"]["value"] > 0.5
 
 
+def test_a_published_agent_says_what_it_needs():
+    if importlib.util.find_spec("l2rpn_baselines"):
+        pytest.skip("it is installed")
+    words = ["evaluate", str(EXAMPLES / "optim_cvxpy.py"), "bus14-R", "--engine", "reference", "--months", "1"]
+    assert main(words) == 2
+
+
 def test_a_published_agent_plays_what_it_asks_grid2op_for(monkeypatch):
     """With an agent in the place of the published one, which needs an environment of its own."""
     spec = importlib.util.spec_from_file_location("optim_cvxpy", EXAMPLES / "optim_cvxpy.py")
