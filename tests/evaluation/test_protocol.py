@@ -315,6 +315,8 @@ def test_bad_requests_are_refused_in_one_sentence(tmp_path):
         "given twice": {"seeds": [3, 3]},
         "give a number of processes": {"workers": -1},
         "Option 'colour' does not exist": {"colour": "red"},
+        "Agent 5 is none": {"agent": 5},
+        "Agent <class .*DoNothing'> is none": {"agent": DoNothing},
     }
     for message, arguments in bad.items():
         with pytest.raises(UsageError, match=message) as caught:

@@ -90,7 +90,7 @@ def evaluate(
         UsageError: the request cannot be met, or ``output`` holds another evaluation. Nothing was written.
     """
     task = find_task(task)
-    chosen = make_agent(agent, task) if isinstance(agent, str | Path) else agent
+    chosen = make_agent(agent, task) if isinstance(agent, str | Path) else _checked(agent)
     keywords = env_keywords(chosen, {**options, "split": split, "heuristic": heuristic})
     options_of(task, keywords)
     resolve_reward(keywords.get("reward", "default"))
@@ -205,6 +205,14 @@ def env_keywords(agent: Agent, keywords: dict[str, Any]) -> dict[str, Any]:
         raise UsageError(f"Option {unknown[0]!r} does not exist: choose from {allowed}.")
     TaskOptions(**keywords)
     return keywords
+
+
+def _checked(agent: Agent) -> Agent:
+    if isinstance(agent, type) or not isinstance(agent, Agent):
+        raise UsageError(
+            f"Agent {agent!r} is none: give a name, a path, or what has a name and the methods bind, reset and act."
+        )
+    return agent
 
 
 def _number_of_workers(workers: int | None, engine: str, agent: str | Path | Agent, n_jobs: int) -> int:
