@@ -18,7 +18,7 @@ from rl2grid.analysis.result_tables import Methods, ranking, ranking_table
 from rl2grid.analysis.section import Section, plan_section
 from rl2grid.records.collection import Collection
 from rl2grid.records.evaluations import Evaluation
-from rl2grid.records.methods import Method, method_label
+from rl2grid.records.methods import Method
 from rl2grid.records.trainings import TrainingRun
 
 UNFOLDED_TASKS = 4
@@ -160,9 +160,9 @@ def _named(place: str, name: str) -> str:
 
 
 def _name(result: Evaluation) -> str:
-    first = result.episodes[0]
+    task = result.episodes[0].task.removeprefix("rl2grid/")
     folder = f", {result.folder}" if result.folder else ""
-    return f"{method_label(first)} on {first.task.removeprefix('rl2grid/')}, {len(result.episodes)} episodes{folder}"
+    return f"{Method((result,)).label} on {task}, {len(result.episodes)} episodes{folder}"
 
 
 def _run_name(run: TrainingRun) -> str:

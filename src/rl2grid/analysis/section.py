@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 
 from rl2grid.analysis import comparison_figures as compare
 from rl2grid.analysis import figures
+from rl2grid.analysis.bounds_table import bounds_table
 from rl2grid.analysis.cautions import cautions
 from rl2grid.analysis.chart import Chart, lifetime_chart, profile_chart, training_chart
 from rl2grid.analysis.curves import MOST_LINES, SMOOTHED_EPISODES
@@ -30,7 +31,7 @@ from rl2grid.envs.tasks import short_id
 from rl2grid.errors import UsageError
 from rl2grid.records.evaluations import Evaluation
 from rl2grid.records.files import make_folder, write_text
-from rl2grid.records.methods import Method, group_methods
+from rl2grid.records.methods import Method, group_bounds, group_methods
 from rl2grid.records.trainings import TrainingCurve, TrainingRun, group_curves
 
 INDEX_FILE, TABLES_FOLDER, FIGURES_FOLDER = "index.md", "tables", "figures"
@@ -61,7 +62,7 @@ class Section:
     """What a results section is made of."""
 
     methods: Methods
-    """By task; empty where nothing but training runs was given."""
+    """By task, without those that know the future beside others; empty where nothing but training runs was given."""
     tables: tuple[ResultTable, ...]
     pictures: tuple[Picture, ...]
 
@@ -73,16 +74,25 @@ OnFile = Callable[[str], None]
 def plan_section(results: Sequence[Evaluation], runs: Sequence[TrainingRun] = ()) -> Section:
     """All tables and figures that apply; nothing is drawn yet.
 
+    Who knows the future stands beside the others in a table of its own, and in no ranking or figure.
+
     Raises:
         UsageError: nothing is given, or results or runs that do not belong into one table or curve.
     """
     if not results and not runs:
         raise UsageError("There is nothing to analyse: give at least one evaluation or training run.")
-    methods = group_methods(results) if results else {}
+    knowing, unaware = ([one for one in results if one.foresight is known] for known in (True, False))
+    ranked = unaware or knowing
+    methods = group_methods(ranked) if ranked else {}
+    bounds = group_bounds(knowing, methods) if unaware and knowing else {}
     curves = group_curves(runs)
     drawn = {task: _trained_first(group, list(curves.get(task, ()))) for task, group in methods.items()}
     pictures = [*training_pictures(curves), *evaluation_pictures(drawn)]
-    return Section(methods, result_tables(methods) if methods else (), tuple(_distinct(pictures)))
+    tables = result_tables(methods) if methods else ()
+    if bounds:
+        best_first = {task: ranking(group) for task, group in methods.items()}
+        tables = (*tables, bounds_table(best_first, bounds))
+    return Section(methods, tables, tuple(_distinct(pictures)))
 
 
 def results_section(

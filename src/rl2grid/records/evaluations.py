@@ -186,6 +186,26 @@ def check_comparable(results: Sequence[Evaluation]) -> None:
     """
     if not results:
         raise UsageError("There are no results: give at least one evaluation.")
+    check_same_question(results)
+    first, *others = results
+    for other in others:
+        if first.foresight != other.foresight:
+            knowing, unaware = (first, other) if first.foresight else (other, first)
+            raise UsageError(
+                f"Results with and without foresight do not belong into one table: {knowing.summary.agent} stepped "
+                f"saved true worlds, which know the future, {unaware.summary.agent} did not."
+            )
+
+
+def check_same_question(results: Sequence[Evaluation]) -> None:
+    """Refuse results of one task that did not answer the same question.
+
+    Args:
+        results: at least one.
+
+    Raises:
+        UsageError: results of different tasks, scenarios, engines or versions.
+    """
     first, *others = results
     for other in others:
         for key in sorted({*first.identity, *other.identity} - _MAY_DIFFER):
@@ -195,12 +215,6 @@ def check_comparable(results: Sequence[Evaluation]) -> None:
                     f"Results of different {key} do not belong into one table: "
                     f"{first.summary.agent} has {mine!r}, {other.summary.agent} has {theirs!r}."
                 )
-        if first.foresight != other.foresight:
-            knowing, unaware = (first, other) if first.foresight else (other, first)
-            raise UsageError(
-                f"Results with and without foresight do not belong into one table: {knowing.summary.agent} stepped "
-                f"saved true worlds, which know the future, {unaware.summary.agent} did not."
-            )
         if _played(first) != _played(other):
             raise UsageError(
                 f"Results of different scenarios or seeds do not belong into one table: {first.summary.agent} played "

@@ -13,7 +13,7 @@ from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
 from rl2grid.mdp.constraint_table import CONSTRAINTS, THRESHOLDS
 from rl2grid.records.episodes import Episode
-from rl2grid.records.evaluations import Evaluation, check_comparable
+from rl2grid.records.evaluations import Evaluation, check_comparable, check_same_question
 from rl2grid.records.statistics import UNIT, Scores
 from rl2grid.records.summary import column_scores, safe_scores
 
@@ -115,6 +115,24 @@ def group_methods(results: Sequence[Evaluation]) -> dict[str, tuple[Method, ...]
         check_comparable(group)
     _check_same_question([group[0] for group in by_task.values()])
     return {task: _methods(group) for task, group in by_task.items()}
+
+
+def group_bounds(
+    results: Sequence[Evaluation], methods: Mapping[str, Sequence[Method]]
+) -> dict[str, tuple[Method, ...]]:
+    """Methods with foresight, by task: bounds, which stand beside the methods and are not ranked with them.
+
+    Args:
+        results: with foresight, at least one.
+        methods: without foresight, by task.
+
+    Raises:
+        UsageError: they do not belong together, or did not answer the question of the methods of their task.
+    """
+    bounds = group_methods(results)
+    for task, group in bounds.items():
+        check_same_question([method.evaluations[0] for method in (*methods.get(task, ()), *group)])
+    return bounds
 
 
 def interval_units(methods: Iterable[Method]) -> str:
