@@ -11,6 +11,7 @@ from sample_results import TASK, result
 
 from rl2grid.analysis.comparison_table import comparison_table, reference_table
 from rl2grid.analysis.result_tables import (
+    HEURISTIC_LETTERS,
     aggregate_table,
     constraint_table,
     ending_table,
@@ -29,6 +30,7 @@ from rl2grid.analysis.table import (
     table_latex,
     table_markdown,
 )
+from rl2grid.engines import HEURISTICS
 from rl2grid.records.methods import group_methods
 from rl2grid.records.statistics import Estimate
 
@@ -65,6 +67,11 @@ def test_survival_has_the_shape_of_the_paper():
     continuous = survival_table(METHODS, "R")
     assert [column.heading for column in continuous.columns[2:]] == ["do-nothing", "V"]
     assert not any(cell.best for cell in continuous.rows[0])  # equal as printed
+
+
+def test_every_heuristic_has_a_letter_that_the_caption_explains():
+    caption = survival_table(METHODS, "T").caption
+    assert all(f"{HEURISTIC_LETTERS[name]}: {name}" in caption for name in HEURISTICS)
 
 
 def test_joint_tasks_have_a_table_of_their_own():

@@ -32,7 +32,7 @@ from rl2grid.records.statistics import (
 )
 
 HEURISTIC_LETTERS: dict[str, str] = {"none": "V", "idle": "I", "recovery": "R", "careful": "C", "secure": "S"}
-"""The paper's, vanilla, idle and recovery; and careful."""
+"""The paper's, vanilla, idle and recovery; and careful and secure."""
 AGGREGATES: dict[str, Aggregate] = {
     "mean": mean_score,
     "median": median_score,
@@ -196,7 +196,7 @@ def survival_table(methods: Methods, kind: str) -> ResultTable:
     caption = (
         f"Mean survival on tasks with {actions} actions (higher is better; best of a task in bold), plus or minus half "
         f"of its interval. {_intervals(methods, tasks)}. "
-        "V: vanilla, I: idle, R: recovery and C: careful heuristic."
+        "V: vanilla, I: idle, R: recovery, C: careful and S: secure heuristic."
     )
     return ResultTable(f"survival-{actions}", caption, columns, tuple(rows))
 

@@ -85,7 +85,7 @@ class Episode:
 
     task: str = _label("id of the task")
     agent: str = _label("what tables call the agent")
-    heuristic: str = _label("`none`, `idle`, `recovery` or `careful`")
+    heuristic: str = _label("`none`, `idle`, `recovery`, `careful` or `secure`")
     split: str = _label("split of the month")
     scenario: str = _fact("the month")
     seed: int = _count("of maintenance, opponent and agent, together with the month")

@@ -44,7 +44,7 @@ class Method:
 
     @property
     def heuristic(self) -> str:
-        """``none``, ``idle``, ``recovery`` or ``careful``."""
+        """``none``, ``idle``, ``recovery``, ``careful`` or ``secure``."""
         return self.first.heuristic
 
     @property
