@@ -104,6 +104,23 @@ def test_the_same_seed_gives_the_same_actions_and_asking_leaves_the_episode_as_i
     assert first[1] == again[1]
 
 
+def test_brought_back_it_plans_anew_and_knows_nothing_of_what_it_saw_later():
+    env = environment("bus36-MO-v0-H0", opponent=False)
+    agent = Planner()
+    play(agent, env, seed=4, steps=40)
+    world = env.unwrapped.save()
+    observation, info = env.unwrapped.restore(world)
+    for _ in range(9):
+        observation, *_, info = env.step(agent.act(observation, info))
+    observation, info = env.unwrapped.restore(world)
+    again = agent.act(observation, info)
+    assert agent._dispatch is not None
+    assert max(step for step, _ in agent._dispatch._history) == info["step"]
+    env.unwrapped.restore(world)
+    asked_twice = agent.act(observation, info)
+    np.testing.assert_array_equal(again["injection"], asked_twice["injection"])
+
+
 def test_curtailment_stays_as_it_is_while_nothing_is_planned():
     env = environment("bus14-R")
     agent = Planner()

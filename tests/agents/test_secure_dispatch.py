@@ -137,6 +137,19 @@ def test_beyond_the_forecasts_the_trend_goes_on():
     np.testing.assert_allclose(dispatch.foreseen(env.state, forecast).ahead[:, 0], 50.0)
 
 
+def test_who_is_brought_back_forgets_what_came_later():
+    env = standing("bus14-R")
+    dispatch = dispatch_of(env)
+    gens = continuous_layout(env.grid).redispatch
+    forecast = np.zeros((1, env.grid.n_gen), np.float32)
+    forecast[0, gens] = 50.0
+    for step, value in ((10, 44.0), (11, 90.0), (12, 10.0), (10, 44.0)):
+        env.state.step[0] = step
+        env.state.gen_p[0][gens] = value
+        dispatch.watch(env.state)
+    np.testing.assert_allclose(dispatch.foreseen(env.state, forecast).ahead[:, 0], 50.0)
+
+
 def test_a_plan_counts_only_what_the_forecast_says_of_the_next_step():
     """Nothing of the true future is read: another future with the same forecasts gives the same plan."""
     plans = []

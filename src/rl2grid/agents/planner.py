@@ -141,8 +141,10 @@ class Planner:
         self._why, self._compared = "", []
         if self._dispatch is not None:
             self._dispatch.watch(state)
-        self._is_plan_void |= int(state.step[0]) > self._step + 1  # a heuristic played between
-        self._step = int(state.step[0])
+        step = int(state.step[0])
+        # A heuristic played between, or the environment was brought back to an earlier moment.
+        self._is_plan_void |= not self._step <= step <= self._step + 1
+        self._step = step
         action = self._choose(self._moment(state))
         if self._search is not None:
             self._topology = topology_part(action)

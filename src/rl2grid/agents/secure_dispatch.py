@@ -111,10 +111,13 @@ class SecureDispatch:
         self._history.clear()
 
     def watch(self, state: GridState) -> None:
-        """Remember what the generators produce by the series; at most once a step."""
+        """Remember what the generators produce by the series.
+
+        Who was brought back to an earlier moment, or is asked twice, forgets what was seen from there on.
+        """
         step = int(state.step[0])
-        self._history.append((step, self._series_now(state)))
-        self._history = [moment for moment in self._history if moment[0] >= step - _TREND]
+        before = [moment for moment in self._history if step - _TREND <= moment[0] < step]
+        self._history = [*before, (step, self._series_now(state))]
 
     def foreseen(self, state: GridState, forecast: F32) -> Series:
         """The series of the redispatchable generators, now and at the horizons of the programme.
