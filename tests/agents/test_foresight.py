@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import gymnasium
+import numpy as np
 import pytest
 
 import rl2grid  # noqa: F401 - registers the tasks
@@ -22,23 +23,33 @@ def foresight(**options: Any) -> Foresight:
     return Foresight(DoNothing(), **{"ahead": 24, "candidates": 6, "attempts": 60, **options})
 
 
-def survived(agent: Any) -> Any:
-    months = first_months(find_task("bus14-T0"), "validation", 1)
-    result = evaluate(agent, "bus14-T0", scenarios=months, episode_length=2016)
+class Shifting(DoNothing):
+    """Redispatches a little in every step, and leaves the topology as it is."""
+
+    injection = np.array([0.1, -0.1, 0.0, 0.0, 0.0, 0.0], np.float32)
+
+    def act(self, observation: Any, info: Any) -> Any:
+        return {"topology": 0, "injection": self.injection}
+
+
+def survived(agent: Any, task: str = "bus14-T0") -> Any:
+    months = first_months(find_task(task), "validation", 1)
+    result = evaluate(agent, task, scenarios=months, episode_length=2016)
     return result.episodes[0]
 
 
-def begun(agent: Foresight) -> tuple[Any, Any, Any]:
+def begun(agent: Foresight, task: str = "bus14-T0") -> tuple[Any, Any, Any]:
     """An environment that the agent plays, with what its reset returned."""
-    env: Any = gymnasium.make("rl2grid/bus14-T0-v0", split="bundled")
+    env: Any = gymnasium.make(f"rl2grid/{task}-v0", split="bundled")
     agent.bind(env)
     observation, info = env.reset(seed=0, options={"scenario": MONTH})
     agent.reset(0)
     return env, observation, info
 
 
-def test_it_outlives_its_guide_and_is_marked():
-    guided, alone = survived(foresight()), survived(DoNothing())
+@pytest.mark.parametrize("task", ["bus14-T0", "bus14-H0"])
+def test_it_outlives_its_guide_and_is_marked(task):
+    guided, alone = survived(foresight(), task), survived(DoNothing(), task)
     assert guided.grid_steps > alone.grid_steps
     assert guided.foresight > 0 == alone.foresight
 
@@ -55,6 +66,18 @@ def test_what_it_plays_is_what_it_foresaw():
         assert foreseen == ([] if over else [info["step"]])
 
 
+def test_in_a_joint_task_another_topology_action_keeps_the_injection_of_the_guide():
+    agent = Foresight(Shifting(), ahead=12, candidates=3, attempts=5)
+    env, observation, info = begun(agent, "bus14-H0")
+    agent.act(observation, info)
+    tried = [action for _, action in agent._attempts_at(list(agent._course))]
+    assert tried
+    for action in tried:
+        assert env.action_space.contains(action)
+        assert action["topology"] != 0
+        np.testing.assert_array_equal(action["injection"], Shifting.injection)
+
+
 def test_it_forgets_the_future_of_an_action_that_was_not_played():
     agent = foresight()
     env, observation, info = begun(agent)
@@ -65,8 +88,8 @@ def test_it_forgets_the_future_of_an_action_that_was_not_played():
     assert agent._course[0].step == info["step"] + 1
 
 
-def test_tasks_with_injections_and_nonsense_are_refused():
-    with pytest.raises(UsageError, match="has injections: choose a topology task"):
+def test_tasks_without_topology_and_nonsense_are_refused():
+    with pytest.raises(UsageError, match="has no topology actions: choose a topology task"):
         foresight().bind(gymnasium.make("rl2grid/bus14-R-v0", split="bundled"))
     for attempts in (0, 2.5, "many", True, None):
         with pytest.raises(UsageError, match=r"attempts=.* is not allowed: give a whole number"):

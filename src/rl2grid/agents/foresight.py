@@ -5,19 +5,20 @@ from __future__ import annotations
 import copy
 import itertools
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from numbers import Integral
 from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
 
-from rl2grid.agents.agent import Action, Agent, Considered, Info, Observation
+from rl2grid.agents.agent import Action, Agent, Considered, Info, Observation, topology_part
 from rl2grid.agents.planner import Planner
 from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.engines.worlds import World
 from rl2grid.errors import UsageError
 from rl2grid.handles import AsOpened
+from rl2grid.mdp.actions import TOPOLOGY
 from rl2grid.mdp.heuristics import is_safe
 from rl2grid.mdp.state import GridState
 
@@ -35,7 +36,7 @@ class _Decision(NamedTuple):
     world: World  # before it
     step: int
     safe: bool
-    action: int
+    action: Action
 
 
 class _Course(NamedTuple):
@@ -53,7 +54,8 @@ class Foresight:
 
     It lets a guide, the planner, play on from saved true worlds, some hours ahead of the episode. Where that ends in a
     game over, it goes back decision by decision, first through the crisis, then to moments before it began, plays
-    another action there and lets the guide go on; what outlives the moment of the death by two hours is kept. So its
+    another topology action there (in a joint task with the injection of the guide) and lets the guide go on; what
+    outlives the moment of the death by two hours is kept. So its
     survival can be reached by one who reacts like the planner and knows all attacks, outages and demand: a lower bound
     of the best possible. It is marked as an agent with foresight and never ranked with others. Its name says who guides
     it and how far it looks, where that is not as by default.
@@ -69,7 +71,7 @@ class Foresight:
     """
 
     name = "foresight"
-    kinds = ("T",)
+    kinds = ("T", "H")
 
     def __init__(
         self,
@@ -95,12 +97,13 @@ class Foresight:
         """Make a copy of the environment, in which the future is played.
 
         Raises:
-            UsageError: a task with injections, or the reference engine, which answers no what-if.
+            UsageError: a task without topology actions, or the reference engine, which answers no what-if.
         """
         base: Any = env.unwrapped
-        if base.task.kind != "T":
+        if not base.task.changes_topology:
             raise UsageError(
-                f"Agent {self.name!r} cannot play {base.task.id}, which has injections: choose a topology task (-T0-)."
+                f"Agent {self.name!r} cannot play {base.task.id}, which has no topology actions: choose a topology "
+                "task (-T0-) or a joint one (-H0-)."
             )
         if not isinstance(base.engine, NativeEngine):
             raise UsageError(f'Agent {self.name!r} asks what-ifs of the native engine: choose engine="native".')
@@ -169,7 +172,7 @@ class Foresight:
         self._why = f"nothing was found that averts the game over of step {course.step}"
         return course
 
-    def _attempts_at(self, decisions: Sequence[_Decision]) -> Iterator[tuple[Sequence[_Decision], int]]:
+    def _attempts_at(self, decisions: Sequence[_Decision]) -> Iterator[tuple[Sequence[_Decision], Action]]:
         """The decisions up to one at which something else is played, and what: the last ones first."""
         crisis = len(decisions) - 1
         while crisis > 0 and not decisions[crisis - 1].safe:
@@ -181,19 +184,22 @@ class Foresight:
             yield from self._others(decisions[: at + 1], remedies)
 
     def _others(
-        self, decisions: Sequence[_Decision], actions: Iterable[int]
-    ) -> Iterator[tuple[Sequence[_Decision], int]]:
-        return ((decisions, action) for action in actions if action != decisions[-1].action)
+        self, decisions: Sequence[_Decision], topologies: Iterable[int]
+    ) -> Iterator[tuple[Sequence[_Decision], Action]]:
+        """The last decision with other topology actions; what it injects in a joint task stays."""
+        played = decisions[-1].action
+        others = (topology for topology in topologies if topology != topology_part(played))
+        return ((decisions, _with_topology(played, topology)) for topology in others)
 
     def _best_at(self, world: World) -> list[int]:
-        """Nothing, and the actions with the least worst loading in the next step."""
+        """Nothing, and the topology actions with the least worst loading in the next step."""
         self._future.restore(world)
         outcomes = self._future.what_if()
         loading = np.where(outcomes.legal, outcomes.worst_loading, np.inf)
         best = np.argsort(loading, kind="stable")[: self._candidates]
         return [int(action) for action in dict.fromkeys([*best[np.isfinite(loading[best])].tolist(), 0])]
 
-    def _play(self, world: World, first: int | None, most: int | None, until: int | None = None) -> _Course:
+    def _play(self, world: World, first: Action | None, most: int | None, until: int | None = None) -> _Course:
         """Let the guide play on, after an action of one's own.
 
         Args:
@@ -209,8 +215,12 @@ class Foresight:
         while not over and (most is None or len(decisions) < most) and (until is None or int(state.step[0]) < until):
             before = future.save() if decisions else world
             step, safe = int(state.step[0]), is_safe(self._opened(state), 0)
-            action = first if first is not None and not decisions else int(self._guide.act(observation, info))
+            action = first if first is not None and not decisions else self._guide.act(observation, info)
             observation, _, lost, completed, info = future.step(action)
             decisions.append(_Decision(before, step, safe, action))
             over = lost or completed
         return _Course(decisions, None if over else future.save(), bool(lost), int(info["step"]))
+
+
+def _with_topology(action: Action, topology: int) -> Action:
+    return {**action, TOPOLOGY: topology} if isinstance(action, Mapping) else topology
