@@ -146,6 +146,18 @@ def test_only_joint_tasks_are_flattened_and_only_once():
         JointAsDiscrete(gymnasium.make("CartPole-v1"))
     with pytest.raises(UsageError, match="flatten them before other wrappers"):
         JointAsDiscrete(JointAsBox(make()))
+    with pytest.raises(UsageError, match="SyncVectorEnv is no vector of rl2grid: flatten each of its environments"):
+        VectorJointAsBox(gymnasium.make_vec("rl2grid/bus14-H0-v0", num_envs=2, vectorization_mode="sync"))
+
+
+def test_a_vector_asks_for_one_dict_of_all_its_actions():
+    action = {"topology": 0, "injection": np.zeros(6, np.float32)}
+    env = gymnasium.make_vec("rl2grid/bus14-H0-v0", num_envs=2, split="bundled")
+    env.reset(seed=0)
+    for actions in ([action, action], [0, 1], None):
+        with pytest.raises(UsageError, match=r"one dict with 'topology', 2 integers .* of shape \(2, 6\)"):
+            env.step(actions)
+    env.close()
 
 
 def test_policies_are_told_of_the_flattened_actions():

@@ -72,12 +72,16 @@ def check_parts(task: Task, action: Any) -> None:
     Raises:
         UsageError: a part is missing, or there is another one.
     """
-    if not isinstance(action, Mapping) or set(action) != {TOPOLOGY, INJECTION}:
+    if not _has_parts(action):
         raise UsageError(
             f"Action {action!r:.80} is none of {task.id}, whose actions are joint: give a dict with {TOPOLOGY!r}, an "
             f"integer from 0 to {task.n_topology_actions - 1}, and {INJECTION!r}, {task.n_injections} numbers from -1 "
             "to 1."
         )
+
+
+def _has_parts(action: Any) -> bool:
+    return isinstance(action, Mapping) and set(action) == {TOPOLOGY, INJECTION}
 
 
 def check_number(task: Task, actions: Any, n: int) -> None:
@@ -86,8 +90,12 @@ def check_number(task: Task, actions: Any, n: int) -> None:
     Raises:
         UsageError: there are more or fewer of them, or of a part of theirs.
     """
-    if task.kind == "H":
-        check_parts(task, actions)
+    if task.kind == "H" and not _has_parts(actions):
+        raise UsageError(
+            f"Actions {actions!r:.80} are none of a vector of {task.id}, whose actions are joint: give one dict with "
+            f"{TOPOLOGY!r}, {n} integers from 0 to {task.n_topology_actions - 1}, and {INJECTION!r}, numbers of shape "
+            f"({n}, {task.n_injections}) from -1 to 1."
+        )
     for part in (actions[TOPOLOGY], actions[INJECTION]) if task.kind == "H" else (actions,):
         given = len(part) if isinstance(part, Sized) and np.iterable(part) else 1
         if given != n:

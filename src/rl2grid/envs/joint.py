@@ -216,6 +216,11 @@ def control_moves(grid: Grid) -> F32:
 
 def _joint_task(env: Any, space: gymnasium.Space[Any]) -> Task:
     task = getattr(env.unwrapped, "task", None)
+    if isinstance(env, VectorEnv) and not isinstance(task, Task):
+        raise UsageError(
+            f"{type(env.unwrapped).__name__} is no vector of rl2grid: flatten each of its environments, or make the "
+            "vector without a vectorization_mode."
+        )
     if not isinstance(task, Task) or task.kind != "H":
         what = task.id if isinstance(task, Task) else type(env.unwrapped).__name__
         raise UsageError(f"{what} is no joint task (-H0-, -H1-, ...): only their actions can be flattened.")
