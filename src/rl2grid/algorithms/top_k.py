@@ -27,12 +27,14 @@ class TopK:
         k: actions that are compared.
 
     Raises:
-        UsageError: ``k`` is below 1.
+        UsageError: ``k`` is below 1, or the policy's actions are continuous.
     """
 
     def __init__(self, policy: PolicyAgent, k: int) -> None:
         if k < 1:
             raise UsageError(f"top_k={k} is not allowed: give a number of actions, at least 1.")
+        if policy.continuous:
+            raise UsageError("A policy with continuous actions has no best few of them: leave top_k out.")
         self._policy, self._k = policy, k
         self.name = f"{policy.name}, best of {k}"
         self.task, self.env_keywords = policy.task, policy.env_keywords
@@ -42,11 +44,9 @@ class TopK:
         """Remember the environment, which is asked for forecasts.
 
         Raises:
-            UsageError: the policy cannot play the task, or its actions are continuous.
+            UsageError: the policy cannot play the task.
         """
         self._policy.bind(env)
-        if self._policy.continuous:
-            raise UsageError("A policy with continuous actions has no best few of them: leave top_k out.")
         base: Any = env.unwrapped
         self._env = base
         self._asks_at_once = base.task.kind == "T" and base.options.engine == "native"
