@@ -31,9 +31,20 @@ def test_others_play_the_same_month_on_the_same_page(capsys, tmp_path):
     ]
 
 
+def test_a_policy_that_looks_before_it_acts_plays_beside_itself(capsys, tmp_path):
+    command_line = ["watch", "pretrained/bus14-T0", "bus14-T0", "--top-k", "3", "--against", "pretrained/bus14-T0"]
+    flags = ["--split", "bundled", "--steps", "4", "--format", "html", "--output", str(tmp_path)]
+    assert main([*command_line, *flags]) == 0
+    output = capsys.readouterr().out
+    assert "pretrained-bus14-T0, best of 3: 4 of " in output
+    assert "pretrained-bus14-T0: 4 of " in output
+
+
 @pytest.mark.parametrize(
     ("flags", "words"),
     [
+        (["pretrained/bus14-T0", "bus14-T0", "--top-k", "0"], "top_k=0 is not allowed"),
+        (["greedy", "bus14-T0", "--top-k", "3"], "leave it out for greedy"),
         (["genius", "bus14-T0"], "choose one of do-nothing"),
         (["do-nothing", "bus14-T0", "--against", "genius"], "choose one of do-nothing"),
         (["do-nothing", "bus14-T0", "--against", "dc-opf"], "Agent 'dc-opf' cannot play"),

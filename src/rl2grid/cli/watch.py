@@ -41,6 +41,12 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--heuristic", default=None, choices=("None", *HEURISTICS), help="by default the agent's own")
     parser.add_argument("--steps", type=int, default=None, help="play no more grid steps than these")
     parser.add_argument(
+        "--top-k",
+        type=int,
+        default=None,
+        help="best actions of the policy of which the what-if chooses; by default 1; those of --against play alone",
+    )
+    parser.add_argument(
         "--every", type=int, default=None, help=f"grid steps between two frames; by default at most {FRAMES} frames"
     )
     parser.add_argument("--format", nargs="+", default=["html", "gif"], choices=FORMATS, help="by default html and gif")
@@ -59,7 +65,7 @@ def _run(options: argparse.Namespace, output: Output) -> int:
     check_folder(options.output)
     try:
         with _progress(output) as progress:
-            recordings = [_play(agent, task, options, progress) for agent in (options.agent, *options.against)]
+            recordings = [_play(agent, task, options, top_k, progress) for agent, top_k in _players(options)]
             make_folder(options.output)
             files = _files(task, recordings, options)
             there = {file for file in files if file.exists()}
@@ -89,8 +95,13 @@ def _check_agents(task: Task, options: argparse.Namespace) -> None:
     from rl2grid.evaluation.protocol import check_playable
 
     asked = {"split": options.split, "heuristic": _heuristic(options)}
-    for agent in (options.agent, *options.against):
-        check_playable(make_agent(agent, task), task, asked)
+    for agent, top_k in _players(options):
+        check_playable(make_agent(agent, task, top_k=top_k), task, asked)
+
+
+def _players(options: argparse.Namespace) -> list[tuple[str, int | None]]:
+    """Who plays, and of how many of its best actions the what-if chooses."""
+    return [(options.agent, options.top_k), *((agent, None) for agent in options.against)]
 
 
 def _files(task: Task, recordings: Sequence[Recording], options: argparse.Namespace) -> dict[Path, list[Recording]]:
@@ -127,7 +138,7 @@ def _result(recording: Recording) -> dict[str, Any]:
     }
 
 
-def _play(agent: str, task: Task, options: argparse.Namespace, progress: Progress) -> Recording:
+def _play(agent: str, task: Task, options: argparse.Namespace, top_k: int | None, progress: Progress) -> Recording:
     from rl2grid.evaluation.watching import play_to_watch
 
     playing = progress.add_task("Playing", total=None)
@@ -139,6 +150,7 @@ def _play(agent: str, task: Task, options: argparse.Namespace, progress: Progres
         seed=options.seed,
         heuristic=_heuristic(options),
         steps=options.steps,
+        top_k=top_k,
         on_step=lambda step, length: progress.update(
             playing, completed=step, total=min(length, options.steps or length)
         ),
