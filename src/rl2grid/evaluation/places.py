@@ -32,7 +32,7 @@ def default_folder(agent: str | Path, made: Agent, task: Task, kind: str, name: 
 def _in_paths(agent: str, made: Agent) -> str:
     """What folders call an agent; one of a user's own gets another folder whenever its file has changed."""
     if is_pretrained(agent):
-        return made.name
+        return in_file_name(Path(agent).as_posix())
     if not is_own(agent):
         return agent
     name = in_file_name(made.name)
