@@ -16,6 +16,7 @@ import pytest
 from forged import rewrite
 
 from rl2grid.errors import UsageError
+from rl2grid.evaluation.agents import make_agent
 from rl2grid.evaluation.protocol import evaluate
 from rl2grid.ledger.making import find_evaluation, make_entry
 from rl2grid.ledger.verification import check_entry, verify_entry
@@ -268,6 +269,16 @@ def test_agents_that_are_not_found_are_asked_for(folder, tmp_path):
     assert verify_entry(make_entry(tmp_path / "mine", agent="random")) is None
     with pytest.raises(UsageError, match="is played differently now"):
         make_entry(tmp_path / "mine", agent="do-nothing")
+
+
+def test_a_policy_that_looks_before_it_acts_makes_an_entry(tmp_path):
+    agent = make_agent("pretrained/bus14-T0", top_k=3)
+    evaluate(agent, "bus14-T0", scenarios=MONTHS[:1], episode_length=60, output=tmp_path / "evaluation")
+    entry = make_entry(tmp_path / "evaluation", agent="pretrained/bus14-T0")
+    assert entry.label == "pretrained-bus14-T0, best of 3"
+    assert verify_entry(entry) is None
+    with pytest.raises(UsageError, match="is not greedy as it is now"):
+        make_entry(tmp_path / "evaluation", agent="greedy")
 
 
 def test_a_folder_must_have_one_evaluation(folder, tmp_path):

@@ -12,6 +12,7 @@ from rl2grid.agents.agent import Action, Agent
 from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import AGENTS, make_agent
+from rl2grid.evaluation.own_agents import is_own
 from rl2grid.ledger.replay import (
     OnProgress,
     after,
@@ -113,15 +114,23 @@ def _find_agent(result: Evaluation, task: Task, run: Path | None, agent: str | N
         candidates = [str(identity["agent"])]
     else:
         raise UsageError(f"Agent {identity['agent']!r} of {result.folder} was not found: name it with --agent.")
+    stored = identity["agent_identity"]
     for candidate in candidates:
-        made = make_agent(candidate, task)
-        if json.loads(json.dumps(getattr(made, "identity", None))) == identity["agent_identity"]:
+        made = make_agent(candidate, task, top_k=_top_k(stored, candidate))
+        if json.loads(json.dumps(getattr(made, "identity", None))) == stored:
             return made
     looked = " or ".join(map(str, candidates)) or f"in {run}"
     raise UsageError(
         f"The agent that was evaluated in {result.folder} is not {looked} as it is now: name it with --agent, or "
         "evaluate again."
     )
+
+
+def _top_k(stored: Any, candidate: str | Path) -> int | None:
+    """Of how many of a policy's best actions the what-if chose; None: it played its best, or is no policy."""
+    if not isinstance(stored, dict) or candidate in AGENTS or is_own(str(candidate)):
+        return None
+    return stored.get("top_k")
 
 
 def _training_facts(run: Path) -> dict[str, Any]:
