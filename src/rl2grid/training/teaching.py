@@ -8,7 +8,6 @@ stored depends neither on the number of workers nor on interruptions; see :mod:`
 from __future__ import annotations
 
 import copy
-import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -153,8 +152,10 @@ def teach(
     chosen = make_agent(teacher, task) if isinstance(teacher, str | Path) else teacher
     learner = make_agent(pupil, task) if isinstance(pupil, str | Path) else pupil
     keywords = _keywords(task, chosen, learner, {**options, "heuristic": heuristic})
-    gamma = float(DISCOUNTS[task.kind] if gamma is None else gamma)
+    gamma = DISCOUNTS[task.kind] if gamma is None else gamma
     _check_numbers(months, seed, pupil_share, gamma, thin, workers)
+    if learner is None and pupil_share != PUPIL_SHARE:
+        raise UsageError(f"pupil_share={pupil_share!r} is of a pupil, and there is none: name it, or leave this out.")
     setup = LabelSetup(
         task,
         chosen,
@@ -162,7 +163,7 @@ def teach(
         float(pupil_share),
         float(thin),
         CANDIDATES if task.changes_topology and says_candidates(chosen) else 0,
-        gamma,
+        float(gamma),
         keywords,
     )
     folder = output or default_folder(
@@ -263,17 +264,17 @@ def _check_pupil(pupil: Agent | None, keywords: Mapping[str, Any]) -> None:
 
 
 def _check_numbers(
-    months: object, seed: object, pupil_share: float, gamma: float, thin: float, workers: object
+    months: object, seed: object, pupil_share: object, gamma: object, thin: object, workers: object
 ) -> None:
     if not _is_whole(months, 1, MOST_MONTHS):
         raise UsageError(f"months={months!r} is not allowed: give a number from 1 to {MOST_MONTHS:,}.")
     if not _is_whole(seed, 0, _MOST_SEEDS - 1):
         raise UsageError(f"seed={seed!r} is not allowed: give an integer from 0 to {_MOST_SEEDS - 1:,}.")
-    if not 0 < pupil_share <= 1:
+    if not _is_number(pupil_share, 0, 1) or pupil_share == 0:
         raise UsageError(f"pupil_share={pupil_share!r} is not allowed: give a probability above 0 and at most 1.")
-    if not 0 <= gamma <= 1:
+    if not _is_number(gamma, 0, 1):
         raise UsageError(f"gamma={gamma!r} is not allowed: give a discount from 0 to 1.")
-    if not (math.isfinite(thin) and 1 <= thin <= 1000):
+    if not _is_number(thin, 1, 1000):
         raise UsageError(f"thin={thin!r} is not allowed: give a number from 1, which keeps every decision, to 1000.")
     if workers is not None and not _is_whole(workers, 0, 1000):
         raise UsageError(f"workers={workers!r} is not allowed: give a number of processes, 0 or more.")
@@ -281,6 +282,10 @@ def _check_numbers(
 
 def _is_whole(value: object, least: int, most: int) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and least <= value <= most
+
+
+def _is_number(value: object, least: float, most: float) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and least <= value <= most
 
 
 def _number_of_workers(workers: int | None, named: bool) -> int:
