@@ -59,8 +59,11 @@ def test_what_is_no_run_is_refused_and_never_executed(tmp_path: Path):
         with pytest.raises(UsageError, match="is not a checkpoint that can be read"):
             rl2grid.load(path)
     assert not (tmp_path / "executed").exists()
-    with pytest.raises(UsageError, match="does not exist"):
+    with pytest.raises(UsageError, match="does not exist: give a run folder, a checkpoint, or pretrained/NAME"):
         rl2grid.load(tmp_path / "elsewhere")
+    (tmp_path / "labels").mkdir()
+    with pytest.raises(UsageError, match="holds no policy: give one that 'rl2grid train' wrote"):
+        rl2grid.load(tmp_path / "labels")
 
 
 def test_the_package_is_imported_without_pytorch():

@@ -65,7 +65,7 @@ def test_a_folder_of_the_same_name_comes_first(tmp_path: Path, monkeypatch: pyte
     assert isinstance(agent, PolicyAgent)
     assert agent.name == "pretrained-bus14-T0"
     (tmp_path / "pretrained" / "bus14-T0").mkdir(parents=True)
-    with pytest.raises(UsageError, match="does not exist"):
+    with pytest.raises(UsageError, match="holds no policy"):
         make_agent("pretrained/bus14-T0")
 
 

@@ -15,7 +15,7 @@ import torch
 
 from rl2grid.agents.agent import Action, Considered, Info, Observation
 from rl2grid.algorithms.checkpoint import load_checkpoint
-from rl2grid.algorithms.pretrained import is_pretrained, pretrained
+from rl2grid.algorithms.pretrained import PREFIX, is_pretrained, pretrained
 from rl2grid.algorithms.registry import find_algorithm
 from rl2grid.envs.joint import JointAsBox, JointAsDiscrete
 from rl2grid.envs.normalization import ObservationNormalizer
@@ -201,9 +201,13 @@ def read_policy(path: Path, task: Task | str | None = None) -> tuple[Path, dict[
     if is_pretrained(path):
         path = pretrained(path).file
     path = Path(path)
+    if not path.exists():
+        raise UsageError(f"{str(path)!r} does not exist: give a run folder, a checkpoint, or {PREFIX}NAME.")
     if path.is_dir():
-        best = path / BEST_FILE
-        path = best if best.is_file() else path / CHECKPOINT_FILE
+        best, latest = path / BEST_FILE, path / CHECKPOINT_FILE
+        if not best.is_file() and not latest.is_file():
+            raise UsageError(f"Folder {str(path)!r} holds no policy: give one that 'rl2grid train' wrote.")
+        path = best if best.is_file() else latest
     contents = load_checkpoint(path, task=None if task is None else find_task(task).id)
     if is_run(path.parent):
         _check_place(path, contents)
