@@ -161,6 +161,8 @@ def test_folders_must_agree(tmp_path: Path):
         read_labels([tmp_path / "a", tmp_path / "c"], "bus14-T0")
     with pytest.raises(UsageError, match="No folder"):
         read_labels([], "bus14-T0")
+    with pytest.raises(UsageError, match="given twice: give each once"):
+        read_labels([tmp_path / "a", tmp_path / "c" / ".." / "a"], "bus14-T0")
 
 
 def test_a_changed_byte_is_noticed(tmp_path: Path):

@@ -241,11 +241,13 @@ def read_labels(folders: Sequence[Path], task_id: str) -> tuple[LabelsDescriptio
         task_id: the task that they are to be of.
 
     Raises:
-        UsageError: a folder holds no labels of the task, not all that were asked for, was changed, or does not belong
-            to the others; or the actions or observations of the task are no longer what they were.
+        UsageError: a folder holds no labels of the task, not all that were asked for, was changed, was given twice, or
+            does not belong to the others; or the actions or observations of the task are no longer what they were.
     """
     if not folders:
         raise UsageError("No folder of labels was given: give at least one that 'rl2grid teach' wrote.")
+    if len({folder.resolve() for folder in folders}) < len(folders):
+        raise UsageError("A folder of labels was given twice: give each once.")
     task = find_task(task_id)
     descriptions = [read_labels_description(folder) for folder in folders]
     for folder, description in zip(folders, descriptions, strict=True):
