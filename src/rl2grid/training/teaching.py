@@ -174,7 +174,9 @@ def teach(
         _folder_name(keywords, seed),
     )
     check_folder(folder)
-    copy.deepcopy(setup).player().close()  # what cannot be played is refused before anything is written
+    # What cannot be played, or whose months have no room, is refused before anything is written.
+    copy.deepcopy(setup).player().close()
+    watch_making(task.grid_id, *make_scenarios(task.grid_id, [_job(task, seed, 0, 0).scenario]), False)
     call = command or _call(teacher, task, keywords, months, seed, pupil, pupil_share, gamma, thin, folder)
     with open_labels(folder, _request(setup, seed), _round(setup, months, call)) as labels:
         named = all(isinstance(each, str | Path | None) for each in (teacher, pupil))
