@@ -58,6 +58,12 @@ def test_months_are_made_once_and_listed(capsys, folder: Path) -> None:
     assert "bus36" not in output
 
 
+def test_a_year_of_training_is_said_to_be_in_the_library(capsys, folder: Path, monkeypatch) -> None:
+    monkeypatch.setattr("rl2grid.cli.data.make_packs", lambda grid, months, workers: iter([len(months)]))
+    assert main(["data", "make", "bus14", "--seed", "1000003"]) == 0
+    assert f"12 months of bus14 are in {folder / 'series'}" in capsys.readouterr().out.replace("\n", "")
+
+
 def test_months_of_a_split_are_made_and_counted(capsys, monkeypatch) -> None:
     assert main(["data", "make", "bus14", "--split", "test", "--months", "2", "--workers", "1"]) == 0
     assert "2 months of bus14" in capsys.readouterr().out

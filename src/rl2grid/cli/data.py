@@ -28,7 +28,7 @@ from rl2grid.cli.output import Output
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid, load_grid, system_ids
 from rl2grid.scenarios import generated, inventory, published
-from rl2grid.scenarios.cache import data_folder, remove_damaged
+from rl2grid.scenarios.cache import data_folder, remove_damaged, series_folder
 from rl2grid.scenarios.download import download_dataset, find_archive
 from rl2grid.scenarios.export import export_scenario
 from rl2grid.scenarios.full import VARIABLE, full_data_folder
@@ -102,7 +102,8 @@ def _make(options: argparse.Namespace, output: Output) -> int:
         task = bar.add_task(f"Making months of {grid.id}", total=len(months))
         for done in make_packs(grid, months, workers):
             bar.update(task, completed=done)
-    folder = data_folder() if options.split == TRAIN else generated.pack_folder(grid)
+    in_library = options.split == TRAIN or options.seed in TRAINING_SEEDS
+    folder = series_folder(grid.id) if in_library else generated.pack_folder(grid)
     output.results(grid=grid.id, months=len(months), folder=folder)
     output.remark(f"{len(months):,} months of {grid.id} are in {folder}.")
     if options.split == TRAIN:
