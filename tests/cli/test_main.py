@@ -105,7 +105,7 @@ def test_tasks_of_one_grid(capsys):
         (["train", "lagrangian-ppo", "bus14-T0", "--seed", "2"], "needs a constraint"),
         (["train", "--resume", "no-such-run"], "holds no run"),
         (["train", "--resume", "no-such-run", "--max-minutes", "-1"], "give a positive number of minutes"),
-        (["train", "--resume", "no-such-run", "--seed", "1"], "Flag --seed does not exist"),
+        (["train", "--resume", "no-such-run", "--seed", "1"], "--seed does not exist: when it goes on, a run keeps"),
         (["train", "ppo", "bus14-T0", "--max-minutes", "0"], "give a positive number of minutes"),
         (["evaluate", "genius", "bus14-T0"], "choose one of do-nothing, random, recovery"),
         (["evaluate", "do-nothing", "bus99-T0"], "with a grid of bus14"),

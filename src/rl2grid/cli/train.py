@@ -104,7 +104,7 @@ def _resume(arguments: list[str]) -> int:
     from rl2grid.training.validation import find_validator
 
     path, flags = Path(arguments[0]), arguments[1:]
-    _refuse_unknown(flags, [*fields(ResumeFlags)])
+    _refuse_unknown(flags, [*fields(ResumeFlags)], "when it goes on, a run keeps what it began with.")
     own = _parse("rl2grid train --resume", flags, ResumeFlags())
     limit = TimeLimit(own.max_minutes)
     args, _ = request.read_config(path)
@@ -123,7 +123,8 @@ def _begin(algorithm: str, task_id: str, flags: list[str]) -> int:
     deciding = {name: _value(flags, f"--{flag_of(name)}") for name in request.DECIDING}
     chosen = {name: value for name, value in deciding.items() if value is not None}
     hyperparameters = request.hyperparameters(algorithm, task, _value(flags, "--preset") or "default", **chosen)
-    _refuse_unknown(flags, [*fields(TrainFlags), *options_without(*GIVEN_OTHERWISE), *fields(hyperparameters)])
+    known = [*fields(TrainFlags), *options_without(*GIVEN_OTHERWISE), *fields(hyperparameters)]
+    _refuse_unknown(flags, known, "see --help after the task for all flags.")
     own, keywords, hyperparameters = _parse_all(f"rl2grid train {algorithm} {task.id}", flags, hyperparameters)
     limit, output = TimeLimit(own.max_minutes), Output(json=own.json, quiet=own.quiet)
     keywords["reward"] = reward_of(keywords["reward"])
@@ -272,7 +273,8 @@ def _sentence(box: str) -> str:
     return " ".join(text[begin:end]).removesuffix(".")
 
 
-def _refuse_unknown(flags: list[str], known: list[Field[Any]]) -> None:
+def _refuse_unknown(flags: list[str], known: list[Field[Any]], advice: str) -> None:
+    """Refuse flags that are not known, with ``advice`` where no known one is spelt nearly so."""
     names = {"--help", *(f"--{flag_of(field.name)}" for field in known)}
     names |= {f"--no-{flag_of(field.name)}" for field in known if field.type == "bool"}
     for flag in flags:
@@ -280,5 +282,5 @@ def _refuse_unknown(flags: list[str], known: list[Field[Any]]) -> None:
         if not flag.startswith("--") or name in names:
             continue
         close = difflib.get_close_matches(name, sorted(names), n=3)
-        hint = f"did you mean {' or '.join(close)}?" if close else "see --help after the task for all flags."
+        hint = f"did you mean {' or '.join(close)}?" if close else advice
         raise UsageError(f"Flag {name} does not exist: {hint}")
