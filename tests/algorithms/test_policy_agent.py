@@ -188,3 +188,17 @@ def test_a_continuous_policy_has_no_best_actions():
     agent.bind(env := SingleToyGrid(TASKS[True]))
     agent.act(*env.reset())
     assert agent.explain() is None
+
+
+def test_a_policy_of_an_old_shape_is_refused_in_one_sentence(tmp_path: Path):
+    ppo = trained(normalize_observations=True)
+    policy = contents(ppo)["policy"]
+    weights = {name: weight[:, 1:] if weight.ndim == 2 else weight for name, weight in policy["network"].items()}
+    save_checkpoint(tmp_path / "weights.pt", contents(ppo, policy={**policy, "network": weights}))
+    with pytest.raises(UsageError, match=r"its weights are those of another network \(size mismatch") as refusal:
+        load_agent(tmp_path / "weights.pt")
+    assert "\n" not in str(refusal.value)
+    statistics = {**policy["normalizer"], "mean": policy["normalizer"]["mean"][1:]}
+    save_checkpoint(tmp_path / "statistics.pt", contents(ppo, policy={**policy, "normalizer": statistics}))
+    with pytest.raises(UsageError, match="observed features were given where"):
+        load_agent(tmp_path / "statistics.pt")

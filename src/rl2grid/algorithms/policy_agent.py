@@ -230,8 +230,15 @@ def agent_of(
     except KeyError as error:
         raise UsageError(f"Checkpoint {str(path)!r} lacks {error}: another version of rl2grid wrote it.") from error
     except (AttributeError, RuntimeError, TypeError) as error:
-        reason = str(error).strip().split("\n")[0]
-        raise UsageError(f"Checkpoint {str(path)!r} holds no policy that can be played: {reason}.") from error
+        raise UsageError(f"Checkpoint {str(path)!r} holds no policy that can be played: {_reason(error)}.") from error
+
+
+def _reason(error: Exception) -> str:
+    """What is wrong, in a line; of weights that do not fit PyTorch says which in a second one."""
+    first, *others = str(error).strip().splitlines() or [""]
+    if not others or not first.startswith("Error(s) in loading state_dict"):
+        return first
+    return f"its weights are those of another network ({others[0].strip().removesuffix('.')})"
 
 
 def _check_place(path: Path, contents: Mapping[str, Any]) -> None:

@@ -77,10 +77,18 @@ class ObservationNormalizer:
         return {"count": self.count, "mean": self.mean.copy(), "squares": self._squares.copy()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Take over the statistics that ``state_dict`` returned."""
-        self.count = int(state["count"])
-        self.mean = np.array(state["mean"], np.float64)
-        self._squares = np.array(state["squares"], np.float64)
+        """Take over the statistics that ``state_dict`` returned.
+
+        Raises:
+            UsageError: they are of observations with another number of features.
+        """
+        mean, squares = np.array(state["mean"], np.float64), np.array(state["squares"], np.float64)
+        if mean.shape != self.mean.shape or squares.shape != self.mean.shape:
+            raise UsageError(
+                f"Statistics of {mean.size} observed features were given where {self.mean.size} are observed: those "
+                "of another version or of another task."
+            )
+        self.count, self.mean, self._squares = int(state["count"]), mean, squares
 
     @property
     def normaliser_hash(self) -> str:
