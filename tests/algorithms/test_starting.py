@@ -232,6 +232,11 @@ def test_the_weight_of_a_teacher_falls_to_zero():
         replace(SMALL, teacher_coefficient=-1.0)
 
 
+def test_a_policy_that_would_never_be_changed_is_refused():
+    with pytest.raises(UsageError, match="the policy would never be changed"):
+        replace(SMALL, actor_starts=SMALL.total_timesteps)
+
+
 # --- Runs -----------------------------------------------------------------------------------------------------------
 
 

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from rl2grid.algorithms.hyperparameters import SharedArgs, added_later
+from rl2grid.errors import UsageError
 
 COEFFICIENT = 1.0
 """Of a learner that begins with the policy of another run, unless another one is asked for."""
@@ -40,6 +41,11 @@ class TeacherArgs(SharedArgs):
             self._check_not_negative("teacher_coefficient")
         if self.actor_starts is not None:
             self._check_not_negative("actor_starts")
+            if self.actor_starts >= self.total_timesteps:
+                raise UsageError(
+                    f"{self.algorithm} needs actor_starts below total_timesteps (--decisions), {self.total_timesteps}, "
+                    f"not {self.actor_starts}: the policy would never be changed."
+                )
 
     def teacher_coefficient_at(self, decisions: int) -> float:
         """The weight after so many decisions, of a run that has a teacher."""
