@@ -168,3 +168,11 @@ def test_refused_action_steps_no_environment():
 def test_wrong_sizes_are_refused(keywords, message):
     with pytest.raises(UsageError, match=message):
         PowerGridVectorEnv("rl2grid/bus14-T0-v0", engine="reference", **keywords)
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, "1", (1, 2), [1, -5], [1, "a"]])
+def test_what_is_no_seed_is_refused(seed):
+    envs = gymnasium.make_vec("rl2grid/bus14-T0-v0", num_envs=2)
+    with pytest.raises(UsageError, match="give an integer that is not negative, or a list of one each"):
+        envs.reset(seed=seed)
+    envs.close()

@@ -75,13 +75,17 @@ class PowerGridVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], Any, ND
     def reset(  # type: ignore[override]
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Begin an episode in every environment."""
-        seeds = (
-            [None if seed is None else seed + i for i in range(self.num_envs)] if not isinstance(seed, list) else seed
-        )
-        if len(seeds) != self.num_envs:
-            raise UsageError(f"{len(seeds)} seeds were given for {self.num_envs} environments: give one each.")
-        batch = self._rows.reset(seeds, options)
+        """Begin an episode in every environment.
+
+        Args:
+            seed: of the first environment, the others have those that follow; or one each. None: go on in the streams
+                that are there.
+            options: see :class:`~rl2grid.envs.grid_env.PowerGridEnv`.
+
+        Raises:
+            UsageError: a seed is no integer or negative, there is not one for each, or an option does not exist.
+        """
+        batch = self._rows.reset(_seeds_of(seed, self.num_envs), options)
         return batch.observations, batch.infos
 
     def step(
@@ -200,3 +204,25 @@ class PowerGridVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], Any, ND
         if not isinstance(i, int | np.integer) or not 0 <= i < self.num_envs:
             raise UsageError(f"Environment {i!r} does not exist: give a number from 0 to {self.num_envs - 1}.")
         return int(i)
+
+
+def _seeds_of(seed: object, num_envs: int) -> list[int | None]:
+    """The seed of each environment; None: its stream goes on.
+
+    Raises:
+        UsageError: one is no integer or negative, or there is not one for each.
+    """
+    if isinstance(seed, list):
+        if len(seed) != num_envs:
+            raise UsageError(f"{len(seed)} seeds were given for {num_envs} environments: give one each.")
+        return [None if each is None else _checked_seed(each) for each in seed]
+    if seed is None:
+        return [None] * num_envs
+    first = _checked_seed(seed)
+    return [first + i for i in range(num_envs)]
+
+
+def _checked_seed(seed: object) -> int:
+    if not isinstance(seed, int | np.integer) or seed < 0:
+        raise UsageError(f"seed={seed!r} is not allowed: give an integer that is not negative, or a list of one each.")
+    return int(seed)
