@@ -54,7 +54,7 @@ class PolicySteps:
             shift_and_scale(advantages)
         legal = data.masks
         if legal is None:
-            legal = torch.ones(1, int(self.policy.widths[-1]), dtype=torch.bool).expand(len(data.actions), -1)
+            legal = torch.ones(len(data.actions), int(self.policy.widths[-1]), dtype=torch.bool)
         write_policy_gradients(
             rows.numpy(),
             data.observations.numpy(),
