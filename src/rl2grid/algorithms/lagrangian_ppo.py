@@ -327,7 +327,7 @@ class LagrangianPPO(ppo.PPO):
         of_rewards, *of_costs = steps
         value = of_rewards.step(rows, data.observations, data.values, data.returns)
         columns = zip(of_costs, data.cost_values.T.contiguous(), data.cost_returns.T.contiguous(), strict=True)
-        cost_values = torch.stack([steps.step(rows, data.observations, *column) for steps, *column in columns])
+        cost_values = torch.stack([of_cost.step(rows, data.observations, *column) for of_cost, *column in columns])
         return CriticLosses(self.args.value_coefficient * (value + cost_values.sum()), value, cost_values)
 
     def state_dict(self) -> dict[str, Any]:
