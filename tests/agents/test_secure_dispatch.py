@@ -119,16 +119,22 @@ def test_a_dispatch_outside_of_what_generators_can_do_has_drifted():
     assert dispatch.is_drifting(env.state, series)
 
 
-def test_beyond_the_forecasts_the_trend_goes_on():
-    env = standing("bus14-R")
-    dispatch = dispatch_of(env)
+def forecast_after(env, dispatch, *moments):
+    """A forecast of 50 MW of every generator, once what they produced at these steps has been watched."""
     gens = continuous_layout(env.grid).redispatch
-    forecast = np.zeros((1, env.grid.n_gen), np.float32)
-    forecast[0, gens] = 50.0
-    for step, value in ((1, 90.0), (8, 40.0), (10, 44.0)):  # the first is too long ago
+    for step, value in moments:
         env.state.step[0] = step
         env.state.gen_p[0][gens] = value
         dispatch.watch(env.state)
+    forecast = np.zeros((1, env.grid.n_gen), np.float32)
+    forecast[0, gens] = 50.0
+    return forecast
+
+
+def test_beyond_the_forecasts_the_trend_goes_on():
+    env = standing("bus14-R")
+    dispatch = dispatch_of(env)
+    forecast = forecast_after(env, dispatch, (1, 90.0), (8, 40.0), (10, 44.0))  # the first is too long ago
     series = dispatch.foreseen(env.state, forecast)
     np.testing.assert_allclose(series.now, 44.0)
     np.testing.assert_allclose(series.ahead[:, 0], [50.0, 54.0, 60.0, 72.0])
@@ -140,13 +146,7 @@ def test_beyond_the_forecasts_the_trend_goes_on():
 def test_who_is_brought_back_forgets_what_came_later():
     env = standing("bus14-R")
     dispatch = dispatch_of(env)
-    gens = continuous_layout(env.grid).redispatch
-    forecast = np.zeros((1, env.grid.n_gen), np.float32)
-    forecast[0, gens] = 50.0
-    for step, value in ((10, 44.0), (11, 90.0), (12, 10.0), (10, 44.0)):
-        env.state.step[0] = step
-        env.state.gen_p[0][gens] = value
-        dispatch.watch(env.state)
+    forecast = forecast_after(env, dispatch, (10, 44.0), (11, 90.0), (12, 10.0), (10, 44.0))
     np.testing.assert_allclose(dispatch.foreseen(env.state, forecast).ahead[:, 0], 50.0)
 
 
