@@ -221,6 +221,21 @@ def test_updates_are_counted_in_decisions(kind: str, frequency: int, starts: int
 
 
 @ALL
+def test_step_sizes_fall_linearly_to_the_share_asked_for(kind: str):
+    steady, falling = trainer(kind), trainer(kind, last_learning_rate_share=0.2)
+    for iteration in range(falling.num_iterations):
+        falling.iterate()
+        share = 1.0 - 0.8 * 64 * iteration / falling.args.total_timesteps
+        assert step_sizes(falling) == pytest.approx([share * size for size in step_sizes(steady)])
+
+
+def step_sizes(one: OffPolicyTrainer) -> list[float]:
+    """Of all optimisers."""
+    learned = one.learned().values()
+    return [part.param_groups[0]["lr"] for part in learned if isinstance(part, torch.optim.Optimizer)]
+
+
+@ALL
 def test_the_budget_is_never_exceeded(kind: str):
     one = trainer(kind, total_timesteps=4 * 16 * 3 - 1)
     while not one.finished:
@@ -320,7 +335,7 @@ def test_another_seed_gives_other_weights_and_episodes(kind: str):
 @ALL
 @pytest.mark.parametrize("in_files", [False, True], ids=["state", "files"])
 def test_a_resumed_run_ends_with_the_weights_of_one_that_was_not_interrupted(kind: str, in_files: bool, tmp_path: Path):
-    changes = {"buffer_size": 150}  # forgets on the way
+    changes = {"buffer_size": 150, "last_learning_rate_share": 0.1}  # forgets on the way
     straight = trainer(kind, **changes)
     metrics = [straight.iterate() for _ in range(straight.num_iterations)][-1]
     for stop in (1, 3, 5):

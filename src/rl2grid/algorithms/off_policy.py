@@ -71,6 +71,9 @@ class OffPolicyArgs(SharedArgs):
     """Discount of one grid step (a transition of n grid steps is discounted by gamma ** n)."""
     max_grad_norm: float = 10.0
     """Gradients of a network are scaled down to this norm when longer."""
+    last_learning_rate_share: float = 1.0
+    """Share of the learning rates that is left at the end of the run, to which they fall linearly with the decisions;
+    1: they stay."""
     device: str = "cpu"
     """Where networks are: ``cpu``, ``cuda``, or ``auto``: a GPU if there is one. Others than the CPU need not be
     reproducible."""
@@ -80,7 +83,7 @@ class OffPolicyArgs(SharedArgs):
         super().__post_init__()
         self._check_counts("train_frequency", "batch_size", "buffer_size")
         self._check_not_negative("learning_starts")
-        self._check_shares("buffer_memory_share")
+        self._check_shares("buffer_memory_share", "last_learning_rate_share")
 
 
 # --- Networks -------------------------------------------------------------------------------------------------------
@@ -220,6 +223,7 @@ class OffPolicyTrainer(Trainer):
         """Play ``num_steps`` decisions in every environment, learning on the way, and return the metrics."""
         if self.observations is None:
             self.see(self.reset())
+        self._set_learning_rates()
         tally, history = Tally(), _History()
         for _ in range(self.args.num_steps):
             self._play(tally)
@@ -266,6 +270,17 @@ class OffPolicyTrainer(Trainer):
             self.memory.load_state_dict(state["memory"])
         self.updates = state["updates"]
         super().load_state_dict(state)
+
+    def _set_learning_rates(self) -> None:
+        """Let the step sizes follow their schedule."""
+        last = self.args.last_learning_rate_share
+        if last == 1.0:
+            return
+        share = 1.0 - (1.0 - last) * self.decisions / self.args.total_timesteps
+        for optimizer in self.learned().values():
+            if isinstance(optimizer, torch.optim.Optimizer):
+                for group in optimizer.param_groups:
+                    group["lr"] = share * group.setdefault("initial_lr", group["lr"])
 
     def _play(self, tally: Tally) -> None:
         """One decision in every environment, remembered."""
