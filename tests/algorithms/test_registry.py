@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import pytest
 
@@ -20,6 +22,7 @@ from rl2grid.errors import UsageError
 from rl2grid.studies.tuning import WEIGHT_CHOICES, search_space
 from rl2grid.training.request import hyperparameters
 
+TUNING = Path(__file__).resolve().parents[2] / "benchmarks" / "results" / "tuning.json"
 OURS = ("ppo", "lagrangian-ppo", "dqn", "sac", "td3", "imitation")
 
 
@@ -57,6 +60,24 @@ def test_each_is_found_by_its_name(name: str):
         assert type(args) is algorithm.args
     assert algorithm.type_hints().keys() == vars(args).keys()
     assert algorithm.search_space.keys() - {"num_envs * num_steps"} <= vars(args).keys()
+
+
+@pytest.mark.parametrize("name", ["ppo", "dqn", "sac"])
+def test_the_preset_tuned_is_what_the_search_found(name: str):
+    found = json.loads(TUNING.read_text())["algorithms"][name]["hyperparameters"]
+    tuned, usual = (find_algorithm(name).preset(preset, continuous=False) for preset in ("tuned", "default"))
+    for key, value in found.items():
+        assert getattr(tuned, key) == (tuple(value) if isinstance(value, list) else pytest.approx(value, rel=0.05)), key
+    others = vars(tuned).keys() - {*found, "last_learning_rate_share"}
+    assert {key: vars(tuned)[key] for key in others} == {key: vars(usual)[key] for key in others}
+
+
+@pytest.mark.parametrize("name", ["ppo", "dqn", "sac"])
+def test_nothing_was_searched_for_continuous_actions(name: str):
+    with pytest.raises(
+        UsageError, match="DQN chooses among discrete" if name == "dqn" else "choose 'default' or 'paper'"
+    ):
+        find_algorithm(name).preset("tuned", continuous=True)
 
 
 def test_kinds_of_tasks_and_names():

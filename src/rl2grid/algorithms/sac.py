@@ -37,14 +37,14 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple
 
 import torch
 from gymnasium.vector import VectorEnv
 from torch import Tensor, nn
 
-from rl2grid.algorithms.hyperparameters import changed_preset
+from rl2grid.algorithms.hyperparameters import changed_preset, refuse_untuned
 from rl2grid.algorithms.networks import PER_ACTION, NetworkFactory, Output
 from rl2grid.algorithms.off_policy import (
     Batch,
@@ -160,7 +160,29 @@ def paper(*, continuous: bool) -> Args:
     )
 
 
-PRESETS: dict[str, Callable[..., Args]] = {"default": default, "paper": paper}
+def tuned(*, continuous: bool) -> Args:
+    """What a search on bus14-T0 with the heuristic ``careful`` found (``benchmarks/tuning.py``), rates rounded.
+
+    Fourteen configurations, 40,000 decisions each: longer trainings and other grids may want other values.
+
+    Raises:
+        UsageError: continuous actions, for which nothing was searched.
+    """
+    refuse_untuned("SAC", continuous)
+    return replace(
+        default(continuous=False),
+        gamma=0.95,
+        batch_size=512,
+        actor_learning_rate=3.9e-3,
+        critic_learning_rate=3.9e-3,
+        last_learning_rate_share=0.05,
+        tau=0.005,
+        last_entropy_share=0.1,
+        actor_layers=(256, 256),
+    )
+
+
+PRESETS: dict[str, Callable[..., Args]] = {"default": default, "paper": paper, "tuned": tuned}
 
 SEARCH_SPACE: dict[str, tuple[Any, ...]] = {
     "num_envs": (10, 20, 50),

@@ -1,0 +1,113 @@
+"""What it costs, and what it gains, to look before acting: policies whose best K actions the what-if compares.
+
+``python benchmarks/top_k.py RUN [RUN ...] [--k 1 3 10 ...] [--months M]`` plays the best policy of each training
+with each K on M validation months behind the first 20, by which it was picked, and adds survival, paired gains and
+processor time of a decision to ``benchmarks/results/top_k.json``. Test months are never played.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+os.environ["OPENBLAS_NUM_THREADS"] = "1"
+os.environ["OMP_NUM_THREADS"] = "1"
+
+import numpy as np
+
+import rl2grid
+from rl2grid.agents.agent import Agent
+from rl2grid.envs.tasks import find_task
+from rl2grid.evaluation.agents import make_agent
+from rl2grid.records.comparisons import paired_differences
+from rl2grid.records.files import write_json
+from rl2grid.records.statistics import UNIT, Scores, estimate
+from rl2grid.records.versions import processor
+from rl2grid.scenarios.library import list_scenarios
+from rl2grid.scenarios.splits import VALIDATION
+
+RESULTS = Path(__file__).resolve().parent / "results" / "top_k.json"
+CHOSEN_ON = 20
+
+
+class Timed:
+    """An agent whose decisions are timed."""
+
+    def __init__(self, agent: Agent) -> None:
+        self._agent = agent
+        self.seconds, self.decisions = 0.0, 0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._agent, name)
+
+    def act(self, observation: Any, info: Any) -> Any:
+        """The agent's action."""
+        began = time.process_time()
+        action = self._agent.act(observation, info)
+        self.seconds += time.process_time() - began
+        self.decisions += 1
+        return action
+
+
+def play(run: str, k: int, months: int) -> tuple[list[float], dict[str, Any]]:
+    """Survival of each month, and what decisions cost."""
+    policy = rl2grid.load(run)
+    task = find_task(policy.task)
+    agent = Timed(policy if k == 1 else make_agent(run, task, top_k=k))
+    scenarios = list_scenarios(task.grid_id, VALIDATION)[CHOSEN_ON : CHOSEN_ON + months]
+    played = rl2grid.evaluate(agent, task, scenarios=scenarios, workers=0)
+    survival = [round(episode.survival, 5) for episode in played.episodes]
+    return survival, {"decisions": agent.decisions, "microseconds": round(1e6 * agent.seconds / agent.decisions, 1)}
+
+
+def compared(survival: dict[str, list[list[float]]]) -> dict[str, dict[str, Any]]:
+    """Mean and gain to K = 1 of every K, with intervals over trainings and months, and Holm's correction."""
+    names = list(survival)
+    scores = [Scores(np.array(survival[name])[:, :, None], UNIT) for name in names]
+    found: dict[str, dict[str, Any]] = {}
+    for name, one in zip(names, map(estimate, scores), strict=True):
+        found[name] = {"survival": [round(float(x), 4) for x in (one.value, one.low, one.high)]}
+    others = [place for place, name in enumerate(names) if name != "1"]
+    differences = paired_differences(scores, [(place, names.index("1")) for place in others])
+    for place, difference in zip(others, differences, strict=True):
+        gain = difference.estimate
+        found[names[place]]["gain"] = [round(float(x), 4) for x in (gain.value, gain.low, gain.high)]
+        found[names[place]]["p"] = round(float(difference.holm), 4)
+    return found
+
+
+def main() -> None:
+    """Play what is asked for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", nargs="+", metavar="RUN", help="trainings of one method, which differ in their seed")
+    parser.add_argument("--k", nargs="+", type=int, default=[1, 3, 10])
+    parser.add_argument("--months", type=int, default=60)
+    arguments = parser.parse_args()
+    first = rl2grid.load(arguments.runs[0])
+    name = f"{first.name} {first.task.removeprefix('rl2grid/')} {first.env_keywords['heuristic'] or 'no heuristic'}"
+    survival: dict[str, list[list[float]]] = {}
+    costs: dict[str, list[dict[str, Any]]] = {}
+    for k in dict.fromkeys([1, *arguments.k]):
+        for run in arguments.runs:
+            months, cost = play(run, k, arguments.months)
+            survival.setdefault(str(k), []).append(months)
+            costs.setdefault(str(k), []).append(cost)
+            print(name, f"K = {k}", run, round(float(np.mean(months)), 3), cost, flush=True)
+    found = compared(survival)
+    for k, each in costs.items():
+        decisions = sum(cost["decisions"] for cost in each)
+        total = sum(cost["microseconds"] * cost["decisions"] for cost in each)
+        found[k] |= {"decisions": decisions, "microseconds": round(total / decisions, 1)}
+    usual: dict[str, Any] = {"processor": processor(), "methods": {}}
+    results = json.loads(RESULTS.read_text()) if RESULTS.exists() else usual
+    results["methods"][name] = {"runs": len(arguments.runs), "months": arguments.months, "k": found}
+    print(json.dumps(found, indent=1))
+    write_json(RESULTS, results, indent=1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,198 @@
+"""Hyperparameters of PPO, DQN and SAC searched for with equal effort, and what was found beside the defaults.
+
+``python benchmarks/tuning.py search [ALGORITHM ...] --folder F`` searches, as ``rl2grid study tune`` does, each
+algorithm with the same number of trials, seeds and decisions, on the first 20 validation months. ``... compare
+--folder F`` trains the presets ``default`` and ``tuned``, which holds what was found, with seeds that the search did
+not use, and plays the policies on the 180 validation months behind these, by which nothing was chosen. Both go on after
+an interruption and write ``benchmarks/results/tuning.json``. Test months are never played.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+os.environ["OPENBLAS_NUM_THREADS"] = "1"
+
+import numpy as np
+from rich.console import Console
+
+import rl2grid
+from rl2grid.envs.tasks import find_task
+from rl2grid.records.comparisons import paired_differences
+from rl2grid.records.files import write_json
+from rl2grid.records.searches import JOURNAL_FILE
+from rl2grid.records.statistics import UNIT, Scores, estimate
+from rl2grid.scenarios.library import list_scenarios
+from rl2grid.scenarios.splits import VALIDATION
+from rl2grid.studies.search import run_tuning
+from rl2grid.studies.tuning import parse_tuning
+from rl2grid.training.runs import resume
+
+RESULTS = Path(__file__).resolve().parent / "results" / "tuning.json"
+CHOSEN_ON = 20
+"""Validation months by which trials, and the policies of a training, are chosen."""
+EFFORT: dict[str, Any] = {
+    "task": "bus14-T0",
+    "heuristic": "careful",
+    "trials": 14,
+    "budget": 40_000,
+    "validations": 4,
+    "months": CHOSEN_ON,
+    "seeds": [1, 2],
+}
+"""The same for all."""
+_RATES = {"low": 1e-4, "high": 5e-3, "log": True}
+_LAYERS = [[64, 64], [128, 128], [256, 256]]
+_OFF_POLICY: dict[str, Any] = {
+    "gamma": [0.9, 0.95, 0.99, 0.995],
+    "train_frequency": [8, 16, 32],
+    "batch_size": [128, 256, 512],
+}
+SPACES: dict[str, dict[str, Any]] = {
+    "ppo": {
+        "gamma": [0.9, 0.95, 0.99, 0.995],
+        "gae_lambda": [0.8, 0.95, 1.0],
+        "actor_learning_rate": _RATES,
+        "critic_learning_rate": _RATES,
+        "num_steps": [16, 32, 64],
+        "update_epochs": [3, 5, 10],
+        "entropy_coefficient": [0.0, 0.003, 0.01, 0.03],
+        "actor_layers": _LAYERS,
+    },
+    "dqn": {
+        **_OFF_POLICY,
+        "learning_rate": _RATES,
+        "target_frequency": [500, 1000, 2000],
+        "epsilon_decay_fraction": [0.1, 0.3, 0.5],
+        "exploration_do_nothing": [0.02, 0.3, 0.6],
+        "layers": _LAYERS,
+    },
+    "sac": {
+        **_OFF_POLICY,
+        "actor_learning_rate": _RATES,
+        "critic_learning_rate": _RATES,
+        "tau": [0.005, 0.01, 0.03],
+        "last_entropy_share": [0.02, 0.05, 0.1],
+        "actor_layers": _LAYERS,
+    },
+}
+"""What is searched: as many hyperparameters of each."""
+FIXED: dict[str, dict[str, Any]] = {
+    "ppo": {},
+    "dqn": {"last_learning_rate_share": 0.05},
+    "sac": {"last_learning_rate_share": 0.05},
+}
+"""The same in all trials: learning rates fall until the end, as PPO's do."""
+PRESETS = ("default", "tuned")
+"""What is compared: the second holds what the searches found, rates rounded."""
+SEEDS = (11, 12, 13)
+"""Of the trainings that are compared."""
+
+
+def search(algorithm: str, folder: Path) -> dict[str, Any] | None:
+    """What was found, what was spent, and every trial; None when interrupted."""
+    contents = {
+        "name": f"{algorithm}-bus14",
+        "algorithm": algorithm,
+        "hyperparameters": FIXED[algorithm],
+        "space": SPACES[algorithm],
+        **EFFORT,
+    }
+    tuning = parse_tuning(contents, folder / algorithm)
+    if run_tuning(tuning, jobs=1, console=Console(stderr=True)) is None:
+        return None
+    found: dict[str, Any] = json.loads((tuning.output / "best.json").read_text())
+    return {**found, "space": SPACES[algorithm], "trials": _trials(tuning.output)}
+
+
+def _trials(folder: Path) -> list[dict[str, Any]]:
+    """Every trial that ended: whether it was ended early, the survival it had reached, what it chose."""
+    import optuna
+    from optuna.storages.journal import JournalFileBackend
+
+    storage = optuna.storages.JournalStorage(JournalFileBackend(str(folder / JOURNAL_FILE)))
+    return [
+        {
+            "state": trial.state.name.lower(),
+            "survival": round(trial.user_attrs.get("survival", 0.0), 4),
+            "chosen": trial.params,
+        }
+        for trial in optuna.load_study(study_name=None, storage=storage).get_trials(deepcopy=False)
+    ]
+
+
+def survival(algorithm: str, preset: str, seed: int, folder: Path) -> list[float]:
+    """Train, or go on, and play the best policy: survival of each of the months that nothing was chosen by."""
+    run = folder / f"{algorithm}-{preset}-{seed}"
+    if run.exists():
+        resume(run)
+    else:
+        rl2grid.train(
+            algorithm,
+            EFFORT["task"],
+            folder=run,
+            preset=preset,
+            hyperparameters={"total_timesteps": EFFORT["budget"], "seed": seed},
+            validation_months=CHOSEN_ON,
+            evaluate_every=EFFORT["budget"] // EFFORT["validations"],
+            heuristic=EFFORT["heuristic"],
+        )
+    months = list_scenarios(find_task(EFFORT["task"]).grid_id, VALIDATION)[CHOSEN_ON:]
+    played = rl2grid.evaluate(run, EFFORT["task"], scenarios=months, workers=0)
+    return [round(episode.survival, 5) for episode in played.episodes]
+
+
+def compared(default: dict[str, list[float]], tuned: dict[str, list[float]]) -> dict[str, Any]:
+    """Means over seeds and months, and how much longer the tuned ones survive, with intervals over both."""
+    scores = [Scores(np.array(list(one.values()))[:, :, None], UNIT) for one in (default, tuned)]
+    means = [estimate(one) for one in scores]
+    (difference,) = paired_differences(scores, [(1, 0)])
+    return {
+        name: [round(float(x), 4) for x in (one.value, one.low, one.high)]
+        for name, one in zip(("default", "tuned", "gain"), (*means, difference.estimate), strict=True)
+    } | {"p": round(float(difference.p), 4)}
+
+
+def compare(algorithm: str, found: dict[str, Any], folder: Path, keep: Callable[[], None]) -> None:
+    """Train and play what is not there yet, and compare."""
+    played = found.setdefault("played", {preset: {} for preset in PRESETS})
+    for seed in SEEDS:
+        for preset in PRESETS:
+            if f"seed {seed}" not in played[preset]:
+                played[preset][f"seed {seed}"] = survival(algorithm, preset, seed, folder)
+                keep()
+    found["compared"] = compared(played["default"], played["tuned"])
+    keep()
+    print(algorithm, json.dumps(found["compared"]))
+
+
+def main() -> None:
+    """Search, or compare, what is asked for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("search", "compare"))
+    parser.add_argument("algorithms", nargs="*", metavar="ALGORITHM", help=f"of {', '.join(SPACES)}; default: all")
+    parser.add_argument("--folder", type=Path, default=Path("tuning"), help="where trainings are kept")
+    arguments = parser.parse_args()
+    results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {"effort": EFFORT, "algorithms": {}}
+    for algorithm in arguments.algorithms or SPACES:
+        if algorithm not in SPACES:
+            parser.error(f"Algorithm {algorithm!r} is not searched: choose among {', '.join(SPACES)}.")
+        if arguments.what == "search":
+            found = search(algorithm, arguments.folder)
+            if found is None:
+                return
+            results["algorithms"][algorithm] = found
+            write_json(RESULTS, results, indent=1)
+            print(algorithm, found["survival"], found["command"])
+        else:
+            found = results["algorithms"][algorithm]
+            compare(algorithm, found, arguments.folder, lambda: write_json(RESULTS, results, indent=1))
+
+
+if __name__ == "__main__":
+    main()
