@@ -2,9 +2,9 @@
 
 ``python benchmarks/tuning.py search [ALGORITHM ...] --folder F`` searches, as ``rl2grid study tune`` does, each
 algorithm with the same number of trials, seeds and decisions, on the first 20 validation months. ``... compare
---folder F`` trains the presets ``default`` and ``tuned``, which holds what was found, with seeds that the search did
-not use, and plays the policies on the 180 validation months behind these, by which nothing was chosen. Both go on after
-an interruption and write ``benchmarks/results/tuning.json``. Test months are never played.
+--folder F`` trains the defaults, the defaults with falling learning rates and what was found, with seeds that the
+search did not use, and plays the policies on the 180 validation months behind these. Both go on after an interruption
+and write ``benchmarks/results/tuning.json``. Test months are never played.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from rl2grid.envs.tasks import find_task
 from rl2grid.records.comparisons import paired_differences
 from rl2grid.records.files import write_json
 from rl2grid.records.searches import JOURNAL_FILE
-from rl2grid.records.statistics import UNIT, Scores, estimate
+from rl2grid.records.statistics import UNIT, Estimate, Scores, estimate
 from rl2grid.scenarios.library import list_scenarios
 from rl2grid.scenarios.splits import VALIDATION
 from rl2grid.studies.search import run_tuning
@@ -88,8 +88,6 @@ FIXED: dict[str, dict[str, Any]] = {
     "sac": {"last_learning_rate_share": 0.05},
 }
 """The same in all trials: learning rates fall until the end, as PPO's do."""
-PRESETS = ("default", "tuned")
-"""What is compared: the second holds what the searches found, rates rounded."""
 SEEDS = (11, 12, 13)
 """Of the trainings that are compared."""
 
@@ -126,9 +124,15 @@ def _trials(folder: Path) -> list[dict[str, Any]]:
     ]
 
 
-def survival(algorithm: str, preset: str, seed: int, folder: Path) -> list[float]:
-    """Train, or go on, and play the best policy: survival of each of the months that nothing was chosen by."""
-    run = folder / f"{algorithm}-{preset}-{seed}"
+def variants(algorithm: str, found: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    """What is compared, as changes of the preset ``default``."""
+    falling = {"falling": FIXED[algorithm]} if FIXED[algorithm] else {}
+    return {"default": {}, **falling, "found": {**FIXED[algorithm], **found["hyperparameters"]}}
+
+
+def survival(algorithm: str, variant: str, changes: Mapping[str, Any], seed: int, folder: Path) -> list[float]:
+    """Train, or go on, and play the best policy: survival of each of the months that no trial was chosen by."""
+    run = folder / f"{algorithm}-{variant}-{seed}"
     if run.exists():
         resume(run)
     else:
@@ -136,8 +140,7 @@ def survival(algorithm: str, preset: str, seed: int, folder: Path) -> list[float
             algorithm,
             EFFORT["task"],
             folder=run,
-            preset=preset,
-            hyperparameters={"total_timesteps": EFFORT["budget"], "seed": seed},
+            hyperparameters={"total_timesteps": EFFORT["budget"], "seed": seed, **changes},
             validation_months=CHOSEN_ON,
             evaluate_every=EFFORT["budget"] // EFFORT["validations"],
             heuristic=EFFORT["heuristic"],
@@ -147,26 +150,34 @@ def survival(algorithm: str, preset: str, seed: int, folder: Path) -> list[float
     return [round(episode.survival, 5) for episode in played.episodes]
 
 
-def compared(default: dict[str, list[float]], tuned: dict[str, list[float]]) -> dict[str, Any]:
-    """Means over seeds and months, and how much longer the tuned ones survive, with intervals over both."""
-    scores = [Scores(np.array(list(one.values()))[:, :, None], UNIT) for one in (default, tuned)]
-    means = [estimate(one) for one in scores]
-    (difference,) = paired_differences(scores, [(1, 0)])
-    return {
-        name: [round(float(x), 4) for x in (one.value, one.low, one.high)]
-        for name, one in zip(("default", "tuned", "gain"), (*means, difference.estimate), strict=True)
-    } | {"p": round(float(difference.p), 4)}
+def compared(played: Mapping[str, Mapping[str, list[float]]]) -> dict[str, Any]:
+    """Means over seeds and months and gains over the defaults, intervals over both, and p with Holm's correction."""
+    names = list(played)
+    scores = [Scores(np.array(list(played[name].values()))[:, :, None], UNIT) for name in names]
+    found: dict[str, dict[str, Any]] = {
+        name: {"survival": _rounded(estimate(one))} for name, one in zip(names, scores, strict=True)
+    }
+    differences = paired_differences(scores, [(place, 0) for place in range(1, len(names))])
+    for name, difference in zip(names[1:], differences, strict=True):
+        found[name] |= {"gain": _rounded(difference.estimate), "p": round(float(difference.holm), 4)}
+    return found
+
+
+def _rounded(one: Estimate) -> list[float]:
+    return [round(float(x), 4) for x in (one.value, one.low, one.high)]
 
 
 def compare(algorithm: str, found: dict[str, Any], folder: Path, keep: Callable[[], None]) -> None:
     """Train and play what is not there yet, and compare."""
-    played = found.setdefault("played", {preset: {} for preset in PRESETS})
+    all_variants = variants(algorithm, found)
+    played = found.setdefault("played", {})
     for seed in SEEDS:
-        for preset in PRESETS:
-            if f"seed {seed}" not in played[preset]:
-                played[preset][f"seed {seed}"] = survival(algorithm, preset, seed, folder)
+        for variant, changes in all_variants.items():
+            months_of = played.setdefault(variant, {})
+            if f"seed {seed}" not in months_of:
+                months_of[f"seed {seed}"] = survival(algorithm, variant, changes, seed, folder)
                 keep()
-    found["compared"] = compared(played["default"], played["tuned"])
+    found["compared"] = compared(played)
     keep()
     print(algorithm, json.dumps(found["compared"]))
 

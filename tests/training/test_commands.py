@@ -24,7 +24,7 @@ CASES: list[tuple[str, str, str, dict[str, Any], dict[str, Any]]] = [
     ("ppo", "bus14-T0", "default", {"seed": 3, "num_envs": 4, "actor_layers": (8, 16)}, {"heuristic": "idle"}),
     ("sac", "bus14-R", "paper", {"gamma": 0.95}, {"maintenance": False, "dispatch": "grid2op", "constraint": "TLO"}),
     ("td3", "bus14-R", "default", {}, {"reward": (1.0, 0.5, 1e-3), "normalize": None, "opponent": False}),
-    ("dqn", "bus14-T0", "tuned", {"gamma": 0.95}, {"heuristic": "careful"}),
+    ("sac", "bus14-T0", "tuned", {"gamma": 0.9}, {"heuristic": "careful"}),
     ("dqn", "bus36-M-T0", "default", {"mask_actions": False, "huber_delta": None}, {"reward": "paper"}),
     ("ppo", "bus14-T0", "paper", {"torch_threads": 2, "device": "auto"}, {"scenario": "a month/of its own"}),
     ("ppo", "bus14-T0", "default", {}, {"episode_length": 2016}),

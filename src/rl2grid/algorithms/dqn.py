@@ -28,7 +28,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
@@ -148,26 +148,7 @@ def paper(*, continuous: bool) -> Args:
     )
 
 
-def tuned(*, continuous: bool) -> Args:
-    """What a search on bus14-T0 with the heuristic ``careful`` found (``benchmarks/tuning.py``), the rate rounded.
-
-    Fourteen configurations, 40,000 decisions each: longer trainings and other grids may want other values.
-    """
-    return replace(
-        default(continuous=continuous),
-        gamma=0.99,
-        train_frequency=16,
-        batch_size=128,
-        learning_rate=2.4e-3,
-        last_learning_rate_share=0.05,
-        target_frequency=2_000,
-        epsilon_decay_fraction=0.5,
-        exploration_do_nothing=0.6,
-        layers=(256, 256),
-    )
-
-
-PRESETS: dict[str, Callable[..., Args]] = {"default": default, "paper": paper, "tuned": tuned}
+PRESETS: dict[str, Callable[..., Args]] = {"default": default, "paper": paper}
 
 SEARCH_SPACE: dict[str, tuple[Any, ...]] = {
     "num_envs": (10, 20, 50),

@@ -141,15 +141,3 @@ def changed_preset(
     if name not in presets:
         raise one_of(f"{algorithm}'s preset", name, tuple(presets))
     return replace(presets[name](continuous=continuous), **changes)
-
-
-def refuse_untuned(algorithm: str, continuous: bool) -> None:
-    """Refuse the preset ``tuned`` where nothing was searched.
-
-    Raises:
-        UsageError: continuous actions.
-    """
-    if continuous:
-        raise UsageError(
-            f"{algorithm}'s preset 'tuned' was searched for with discrete actions: choose 'default' or 'paper'."
-        )

@@ -14,7 +14,7 @@ The objective
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
@@ -23,7 +23,7 @@ from torch import Tensor
 
 from rl2grid.algorithms.compiled_steps import PolicySteps, ValueSteps, policy_steps, value_steps
 from rl2grid.algorithms.diagnostics import explained_variance, mean
-from rl2grid.algorithms.hyperparameters import changed_preset, refuse_untuned
+from rl2grid.algorithms.hyperparameters import changed_preset
 from rl2grid.algorithms.on_policy import (
     ActorCritic,
     CriticLosses,
@@ -112,27 +112,7 @@ def paper(*, continuous: bool) -> Args:
     )
 
 
-def tuned(*, continuous: bool) -> Args:
-    """What a search on bus14-T0 with the heuristic ``careful`` found (``benchmarks/tuning.py``), rates rounded.
-
-    Fourteen configurations, 40,000 decisions each: longer trainings and other grids may want other values.
-
-    Raises:
-        UsageError: continuous actions, for which nothing was searched.
-    """
-    refuse_untuned("PPO", continuous)
-    return replace(
-        default(continuous=False),
-        gamma=0.99,
-        gae_lambda=0.8,
-        actor_learning_rate=1e-3,
-        critic_learning_rate=6e-4,
-        entropy_coefficient=0.0,
-        actor_layers=(64, 64),
-    )
-
-
-PRESETS: dict[str, Callable[..., Args]] = {"default": default, "paper": paper, "tuned": tuned}
+PRESETS: dict[str, Callable[..., Args]] = {"default": default, "paper": paper}
 
 SEARCH_SPACE: dict[str, tuple[float, ...]] = {
     "num_envs": (10, 20, 50),

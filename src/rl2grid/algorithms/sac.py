@@ -44,7 +44,7 @@ import torch
 from gymnasium.vector import VectorEnv
 from torch import Tensor, nn
 
-from rl2grid.algorithms.hyperparameters import changed_preset, refuse_untuned
+from rl2grid.algorithms.hyperparameters import changed_preset
 from rl2grid.algorithms.networks import PER_ACTION, NetworkFactory, Output
 from rl2grid.algorithms.off_policy import (
     Batch,
@@ -60,6 +60,7 @@ from rl2grid.algorithms.registry import Algorithm
 from rl2grid.algorithms.sampling import drawn, legal_log_softmax
 from rl2grid.algorithms.starting import StartingPolicy
 from rl2grid.algorithms.teacher import TeacherArgs, divergences
+from rl2grid.errors import UsageError
 
 # --- Hyperparameters ------------------------------------------------------------------------------------------------
 
@@ -168,7 +169,8 @@ def tuned(*, continuous: bool) -> Args:
     Raises:
         UsageError: continuous actions, for which nothing was searched.
     """
-    refuse_untuned("SAC", continuous)
+    if continuous:
+        raise UsageError("SAC's preset 'tuned' was searched for with discrete actions: choose 'default' or 'paper'.")
     return replace(
         default(continuous=False),
         gamma=0.95,
