@@ -66,6 +66,8 @@ def test_the_first_page_says_what_was_measured():
 
     page = " ".join((ROOT / "docs" / "index.md").read_text(encoding="utf-8").split())
     assert f"**{survivals('bus14-T0', 'greedy', 'planner')[-1]:.1%}** of a month" in page
+    learned = survivals("bus14-T0", "ppo", "dqn", "sac")
+    assert f"**{100 * learned[0]:.0f} to {learned[-1]:.0%}** there by agents that learned" in page
     assert f"**{survivals('bus36-MO-v0-T1', 'greedy')[-1]:.0%}** by the same search" in page
     assert f"**{survivals('bus36-MO-v0-T1', 'planner')[-1]:.0%}** by the planner's sequences" in page
     worse, better = survivals("bus36-MO-v0-T0", "ppo")
