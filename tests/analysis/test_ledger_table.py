@@ -108,3 +108,14 @@ def test_the_figure_has_a_line_per_configuration_the_longest_lived_on_top():
     assert points == pytest.approx([0.15, 0.725, 1.0])
     with pytest.raises(ValueError, match="no result of rl2grid/bus14-R-v0"):
         draw_ledger(results, "rl2grid/bus14-R-v0")
+
+
+def test_policies_of_the_package_are_drawn_as_trained():
+    configuration = {"agent": "pretrained/bus14-T0", "policy_hash": "0" * 16, "task": TASK, "heuristic": None}
+    policy = hashed_test(configuration, {}, result("pretrained/bus14-T0", [[0.9], [1.0]], **MONTHS))
+    none = untrained("do-nothing", [0.1, 0.2])
+    figure = draw_ledger({"a": none, "b": policy}, TASK)
+    (axes,) = figure.axes
+    _, nothing, _, package = (line.get_color() for line in axes.lines)
+    untrained_handle, trained_handle = figure.legends[0].legend_handles
+    assert (nothing, package) == (untrained_handle.get_color(), trained_handle.get_color())

@@ -32,27 +32,34 @@ def draw_ledger(results: Mapping[str, HashedTest], task: str, *, theme: Theme = 
     if not rows:
         raise ValueError(f"The ledger has no result of {task}.")
     found = sorted(((estimate(row.scores("survival")), row) for row in rows), key=lambda one: one[0].value)
+    names = [wrapped_label(_name(row)) for _, row in found]
+    height = 0.44 if any("\n" in name for name in names) else 0.32
     # Letters that can be read on a phone, where the figure is three inches wide.
     letters = dict.fromkeys(("xtick.labelsize", "ytick.labelsize", "axes.labelsize", "legend.fontsize"), 10.5)
     with matplotlib.rc_context({**style(theme), **letters}):
-        figure = Figure(figsize=(6.2, 1.3 + 0.32 * len(rows)), layout="constrained")
+        figure = Figure(figsize=(6.2, 1.3 + height * len(rows)), layout="constrained")
         axes = figure.subplots()
         for place, (survival, row) in enumerate(found):
-            colour = theme.series[int(bool(row.first.training))]
+            colour = theme.series[int(_has_learned(row))]
             axes.plot([survival.low, survival.high], [place, place], color=colour, linewidth=2, alpha=0.55)
             axes.plot(survival.value, place, marker="o", color=colour, markersize=6)
             if row.first.training and len(row.results) > 1:
                 each = [one.test["survival"][0] for one in row.results]
                 axes.plot(each, [place] * len(each), linestyle="", marker="|", color=colour, markersize=9)
-        axes.set_yticks(range(len(found)), [wrapped_label(_name(row)) for _, row in found])
+        axes.set_yticks(range(len(found)), names)
         axes.set(xlim=(0, 1.01), ylim=(-0.6, len(found) - 0.4), xlabel="Share of the month survived")
         axes.xaxis.set_major_formatter(PercentFormatter(1.0))
         axes.grid(axis="x")
         axes.set_title(f"{short_id(task)}, test months", loc="left")
-        if any(row.first.training for row in rows):
+        if any(map(_has_learned, rows)):
             # Below the axes, where it covers no result.
             figure.legend(handles=_legend(theme), loc="outside lower center", ncols=2, frameon=False)
     return figure
+
+
+def _has_learned(row: LedgerRow) -> bool:
+    """Whether a policy was played; of those of the package, the ledger tells no training."""
+    return bool(row.first.training) or "policy_hash" in row.first.configuration
 
 
 def _name(row: LedgerRow) -> str:
