@@ -12,6 +12,7 @@ from documentation import PAGES, blocks, name_of
 
 from rl2grid.algorithms.pretrained import cards
 from rl2grid.cli import main as command_line
+from rl2grid.envs.registration import own_systems, unregister_system
 from rl2grid.envs.tasks import find_task
 from rl2grid.evaluation.agents import AGENTS
 from rl2grid.training import request, runs, validation
@@ -82,7 +83,17 @@ def test_quick_commands_run(line, tmp_path, monkeypatch):
     assert command_line.main(arguments_of(line)) == 0
 
 
+@pytest.fixture
+def systems_are_forgotten():
+    """What a page registers is not there for the tests that follow."""
+    before = {system.id for system in own_systems()}
+    yield
+    for name in {system.id for system in own_systems()} - before:
+        unregister_system(name)
+
+
 @pytest.mark.slow
+@pytest.mark.usefixtures("systems_are_forgotten")
 @pytest.mark.parametrize("page", PYTHON_PAGES, ids=name_of)
 def test_python_blocks_run(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
