@@ -22,23 +22,17 @@ os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
 import gymnasium
 import numpy as np
+from gains import CHOSEN_ON, compared, survival_behind
 
 import rl2grid
-from rl2grid.envs.tasks import find_task
 from rl2grid.mdp.features import OPERATOR_FEATURES
-from rl2grid.records.comparisons import paired_differences
 from rl2grid.records.files import write_json
-from rl2grid.records.statistics import UNIT, Scores
 from rl2grid.records.versions import processor
-from rl2grid.scenarios.library import list_scenarios
-from rl2grid.scenarios.splits import VALIDATION
 
 RESULTS = Path(__file__).resolve().parent / "results" / "operator_features.json"
 TASKS = ("bus14-T0", "bus36-MO-v0-T0", "bus118-MOB-v0-T0")
 GROUPS: tuple[str | None, ...] = (None, *OPERATOR_FEATURES, "all")
 NUM_ENVS, WARM_STEPS, STEPS = 256, 10, 60
-CHOSEN_ON = 20
-"""Validation months by which the best policy of a training is kept."""
 
 
 def cost(task: str, groups: str | None) -> float:
@@ -71,28 +65,7 @@ def survival(arguments: argparse.Namespace, groups: str | None, seed: int) -> li
             heuristic=arguments.heuristic,
             operator_features=groups,
         )
-        months = list_scenarios(find_task(arguments.task).grid_id, VALIDATION)
-        played = rl2grid.evaluate(
-            run, arguments.task, scenarios=months[CHOSEN_ON : CHOSEN_ON + arguments.months], workers=0
-        )
-    return [round(episode.survival, 5) for episode in played.episodes]
-
-
-def compared(by_groups: dict[str, dict[str, list[float]]]) -> dict[str, Any]:
-    """Means, and differences to the paper's observation on the same months, with Holm's correction."""
-    names = list(by_groups)
-    scores = [Scores(np.array(list(by_groups[name].values()))[:, :, None], UNIT) for name in names]
-    plain = names.index("none")
-    others = [k for k in range(len(names)) if k != plain]
-    differences = paired_differences(scores, [(k, plain) for k in others])
-    found: dict[str, Any] = {
-        name: {"mean": round(float(one.values.mean()), 4)} for name, one in zip(names, scores, strict=True)
-    }
-    for k, one in zip(others, differences, strict=True):
-        low, high = one.estimate.low, one.estimate.high
-        found[names[k]]["gain"] = [round(float(x), 4) for x in (one.estimate.value, low, high)]
-        found[names[k]]["p"] = round(float(one.holm), 4)
-    return found
+        return survival_behind(run, arguments.task, arguments.months)
 
 
 def main() -> None:
@@ -122,7 +95,7 @@ def main() -> None:
                 runs[f"seed {seed}"] = survival(arguments, None if groups == "none" else groups, seed)
                 print(groups, seed, round(float(np.mean(runs[f"seed {seed}"])), 4), flush=True)
                 write_json(RESULTS, results, indent=1)
-    family["compared"] = compared(family["survival"])
+    family["compared"] = compared({name: list(runs.values()) for name, runs in family["survival"].items()}, "none")
     print(json.dumps(family["compared"], indent=1))
     write_json(RESULTS, results, indent=1)
 

@@ -18,20 +18,16 @@ os.environ["OPENBLAS_NUM_THREADS"] = "1"
 os.environ["OMP_NUM_THREADS"] = "1"
 
 import numpy as np
+from gains import compared, survival_behind
 
 import rl2grid
 from rl2grid.agents.agent import Agent
 from rl2grid.envs.tasks import find_task
 from rl2grid.evaluation.agents import make_agent
-from rl2grid.records.comparisons import paired_differences
 from rl2grid.records.files import write_json
-from rl2grid.records.statistics import UNIT, Scores, estimate
 from rl2grid.records.versions import processor
-from rl2grid.scenarios.library import list_scenarios
-from rl2grid.scenarios.splits import VALIDATION
 
 RESULTS = Path(__file__).resolve().parent / "results" / "top_k.json"
-CHOSEN_ON = 20
 
 
 class Timed:
@@ -56,28 +52,9 @@ class Timed:
 def play(run: str, k: int, months: int) -> tuple[list[float], dict[str, Any]]:
     """Survival of each month, and what decisions cost."""
     policy = rl2grid.load(run)
-    task = find_task(policy.task)
-    agent = Timed(policy if k == 1 else make_agent(run, task, top_k=k))
-    scenarios = list_scenarios(task.grid_id, VALIDATION)[CHOSEN_ON : CHOSEN_ON + months]
-    played = rl2grid.evaluate(agent, task, scenarios=scenarios, workers=0)
-    survival = [round(episode.survival, 5) for episode in played.episodes]
+    agent = Timed(policy if k == 1 else make_agent(run, find_task(policy.task), top_k=k))
+    survival = survival_behind(agent, policy.task, months)
     return survival, {"decisions": agent.decisions, "microseconds": round(1e6 * agent.seconds / agent.decisions, 1)}
-
-
-def compared(survival: dict[str, list[list[float]]]) -> dict[str, dict[str, Any]]:
-    """Mean and gain to K = 1 of every K, with intervals over trainings and months, and Holm's correction."""
-    names = list(survival)
-    scores = [Scores(np.array(survival[name])[:, :, None], UNIT) for name in names]
-    found: dict[str, dict[str, Any]] = {}
-    for name, one in zip(names, map(estimate, scores), strict=True):
-        found[name] = {"survival": [round(float(x), 4) for x in (one.value, one.low, one.high)]}
-    others = [place for place, name in enumerate(names) if name != "1"]
-    differences = paired_differences(scores, [(place, names.index("1")) for place in others])
-    for place, difference in zip(others, differences, strict=True):
-        gain = difference.estimate
-        found[names[place]]["gain"] = [round(float(x), 4) for x in (gain.value, gain.low, gain.high)]
-        found[names[place]]["p"] = round(float(difference.holm), 4)
-    return found
 
 
 def main() -> None:
@@ -97,7 +74,7 @@ def main() -> None:
             survival.setdefault(str(k), []).append(months)
             costs.setdefault(str(k), []).append(cost)
             print(name, f"K = {k}", run, round(float(np.mean(months)), 3), cost, flush=True)
-    found = compared(survival)
+    found = compared(survival, "1")
     for k, each in costs.items():
         decisions = sum(cost["decisions"] for cost in each)
         total = sum(cost["microseconds"] * cost["decisions"] for cost in each)

@@ -18,24 +18,17 @@ from typing import Any
 
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
-import numpy as np
+from gains import CHOSEN_ON, compared, survival_behind
 from rich.console import Console
 
 import rl2grid
-from rl2grid.envs.tasks import find_task
-from rl2grid.records.comparisons import paired_differences
 from rl2grid.records.files import write_json
 from rl2grid.records.searches import JOURNAL_FILE
-from rl2grid.records.statistics import UNIT, Estimate, Scores, estimate
-from rl2grid.scenarios.library import list_scenarios
-from rl2grid.scenarios.splits import VALIDATION
 from rl2grid.studies.search import run_tuning
 from rl2grid.studies.tuning import parse_tuning
 from rl2grid.training.runs import resume
 
 RESULTS = Path(__file__).resolve().parent / "results" / "tuning.json"
-CHOSEN_ON = 20
-"""Validation months by which trials, and the policies of a training, are chosen."""
 EFFORT: dict[str, Any] = {
     "task": "bus14-T0",
     "heuristic": "careful",
@@ -145,26 +138,7 @@ def survival(algorithm: str, variant: str, changes: Mapping[str, Any], seed: int
             evaluate_every=EFFORT["budget"] // EFFORT["validations"],
             heuristic=EFFORT["heuristic"],
         )
-    months = list_scenarios(find_task(EFFORT["task"]).grid_id, VALIDATION)[CHOSEN_ON:]
-    played = rl2grid.evaluate(run, EFFORT["task"], scenarios=months, workers=0)
-    return [round(episode.survival, 5) for episode in played.episodes]
-
-
-def compared(played: Mapping[str, Mapping[str, list[float]]]) -> dict[str, Any]:
-    """Means over seeds and months and gains over the defaults, intervals over both, and p with Holm's correction."""
-    names = list(played)
-    scores = [Scores(np.array(list(played[name].values()))[:, :, None], UNIT) for name in names]
-    found: dict[str, dict[str, Any]] = {
-        name: {"survival": _rounded(estimate(one))} for name, one in zip(names, scores, strict=True)
-    }
-    differences = paired_differences(scores, [(place, 0) for place in range(1, len(names))])
-    for name, difference in zip(names[1:], differences, strict=True):
-        found[name] |= {"gain": _rounded(difference.estimate), "p": round(float(difference.holm), 4)}
-    return found
-
-
-def _rounded(one: Estimate) -> list[float]:
-    return [round(float(x), 4) for x in (one.value, one.low, one.high)]
+    return survival_behind(run, EFFORT["task"])
 
 
 def compare(algorithm: str, found: dict[str, Any], folder: Path, keep: Callable[[], None]) -> None:
@@ -177,7 +151,7 @@ def compare(algorithm: str, found: dict[str, Any], folder: Path, keep: Callable[
             if f"seed {seed}" not in months_of:
                 months_of[f"seed {seed}"] = survival(algorithm, variant, changes, seed, folder)
                 keep()
-    found["compared"] = compared(played)
+    found["compared"] = compared({name: list(runs.values()) for name, runs in played.items()}, "default")
     keep()
     print(algorithm, json.dumps(found["compared"]))
 
