@@ -1,6 +1,7 @@
 """Results on the pages, made from the ledger while the site is built: a figure and a short table of each task.
 
-Pages name the tasks, with ``<!-- results: bus14-T0 -->``, or with ``<!-- figure: bus14-T0 -->`` for the figure alone.
+Pages name the tasks, with ``<!-- results: bus14-T0 -->``, or with ``<!-- figure: bus14-T0 -->`` for the figure alone;
+``<!-- overview -->`` is the table of all tasks.
 """
 
 from __future__ import annotations
@@ -16,12 +17,14 @@ from mkdocs.structure.pages import Page
 from pictures import add_picture, picture_markdown
 
 from rl2grid.analysis.ledger_figure import draw_ledger
+from rl2grid.analysis.ledger_overview import overview_table
 from rl2grid.analysis.ledger_table import short_ledger_table
 from rl2grid.envs.tasks import find_task
 from rl2grid.records.ledger import HashedTest, read_ledger
 
 LEDGER = Path(__file__).resolve().parents[2] / "benchmarks" / "results" / "baselines.json"
 PAGES = ("results.md", "index.md")
+_OVERVIEW = "<!-- overview -->"
 _MARK = re.compile(r"<!-- (results|figure): (\S+) -->")
 
 
@@ -38,7 +41,8 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     """Put figures and tables where the page asks for them."""
     if page.file.src_uri not in PAGES:
         return markdown
-    return _MARK.sub(partial(_shown, read_ledger(LEDGER)), markdown)
+    results = read_ledger(LEDGER)
+    return _MARK.sub(partial(_shown, results), markdown).replace(_OVERVIEW, overview_table(results))
 
 
 def _shown(results: Mapping[str, HashedTest], mark: re.Match[str]) -> str:

@@ -3,44 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import pytest
+from sample_ledger import MONTHS, ledger, trained, untrained
 from sample_results import TASK, result
 
 from rl2grid.analysis.ledger_figure import draw_ledger
 from rl2grid.analysis.ledger_table import LEGEND, ledger_table
 from rl2grid.errors import UsageError
-from rl2grid.records.evaluations import identity_hash
-from rl2grid.records.ledger import HashedTest, hashed_test, read_ledger
+from rl2grid.records.ledger import hashed_test, read_ledger
 
 ROOT = Path(__file__).parents[2]
-MONTHS = {"split": "test", "split_version": "2", "generator_version": "1"}
-
-
-def untrained(agent: str, survivals: list[float]) -> HashedTest:
-    configuration = {"agent": agent, "task": TASK, "heuristic": None}
-    return hashed_test(configuration, {}, result(agent, [[one] for one in survivals], **MONTHS))
-
-
-def trained(
-    seed: int, survivals: list[float], last: list[float] | None = None, steps: int = 1000, **changes: Any
-) -> HashedTest:
-    hyperparameters = {"seed": seed, "total_timesteps": steps}
-    configuration = {"algorithm": "ppo", "task": TASK, "hyperparameters": hyperparameters, "targets_version": 2}
-    configuration |= {"env_keywords": {"heuristic": "idle"}}
-    training = {"grid_steps": 5_000_000, "minutes": 3.0, "validation_survival": 0.75, "decisions": steps}
-    training |= {"identity": {}, "tested_before": changes.pop("tested_before", False)}
-    played = [
-        None if values is None else result("ppo", [[one] for one in values], "idle", **MONTHS)
-        for values in (survivals, last)
-    ]
-    assert played[0] is not None
-    return hashed_test({**configuration, **changes}, training, played[0], played[1])
-
-
-def ledger(*results: HashedTest) -> dict[str, HashedTest]:
-    return {identity_hash(one.configuration): one for one in results}
 
 
 def cells(table: str, start: str) -> dict[str, str]:

@@ -85,6 +85,8 @@ def test_entries_are_ranked_by_survival(folder, capsys, monkeypatch):
         (["table", "{}/random.json", "{}/two.json"], "different scenarios or seeds"),
         (["table", "{}/random.json", "--to", "greedy"], "--to is for the rows of a --ledger"),
         (["table", "{}/random.json", "--task", "bus14-T0"], "--task is for the rows of a --ledger"),
+        (["table", "{}/random.json", "--best"], "--best is for the rows of a --ledger"),
+        (["table", "--ledger", "{}/random.json", "--best", "--to", "greedy"], "leave out --task and --to"),
         (["table", "{}/random.json", "--ledger", "{}/ledger.json"], "do not belong into one table"),
         (["table", "--ledger", "{}/ledger.json", "--l2rpn"], "a ledger does not keep what its episodes cost"),
         (["table", "--ledger", "{}/ledger.json"], "There is no ledger"),

@@ -40,7 +40,7 @@ def draw_ledger(results: Mapping[str, HashedTest], task: str, *, theme: Theme = 
         figure = Figure(figsize=(6.2, 1.3 + height * len(rows)), layout="constrained")
         axes = figure.subplots()
         for place, (survival, row) in enumerate(found):
-            colour = theme.series[int(_has_learned(row))]
+            colour = theme.series[int(row.first.has_learned)]
             axes.plot([survival.low, survival.high], [place, place], color=colour, linewidth=2, alpha=0.55)
             axes.plot(survival.value, place, marker="o", color=colour, markersize=6)
             if row.first.training and len(row.results) > 1:
@@ -51,15 +51,10 @@ def draw_ledger(results: Mapping[str, HashedTest], task: str, *, theme: Theme = 
         axes.xaxis.set_major_formatter(PercentFormatter(1.0))
         axes.grid(axis="x")
         axes.set_title(f"{short_id(task)}, test months", loc="left")
-        if any(map(_has_learned, rows)):
+        if any(row.first.has_learned for row in rows):
             # Below the axes, where it covers no result.
             figure.legend(handles=_legend(theme), loc="outside lower center", ncols=2, frameon=False)
     return figure
-
-
-def _has_learned(row: LedgerRow) -> bool:
-    """Whether a policy was played; of those of the package, the ledger tells no training."""
-    return bool(row.first.training) or "policy_hash" in row.first.configuration
 
 
 def _name(row: LedgerRow) -> str:

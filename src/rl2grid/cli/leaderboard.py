@@ -77,6 +77,9 @@ def _add_table(actions: Any) -> None:
     parser.add_argument(
         "--to", default=None, metavar="NAME", help="of a ledger: what rows are compared with, as 'greedy + recovery'"
     )
+    parser.add_argument(
+        "--best", action="store_true", help="of a ledger: the best of each kind of agent, a row per task"
+    )
     add_scores_flag(parser)
     parser.set_defaults(run=_table)
 
@@ -166,10 +169,12 @@ def _verified(found: Mapping[str, str | None], output: Output) -> int:
 def _check_what_is_ranked(options: argparse.Namespace) -> None:
     """Refuse files beside a ledger, and flags of the one for the other: they would be passed over in silence."""
     if options.ledger is None:
-        for flag, value in (("--task", options.only), ("--to", options.to)):
+        for flag, value in (("--task", options.only), ("--to", options.to), ("--best", options.best or None)):
             if value is not None:
                 raise UsageError(f"{flag} is for the rows of a --ledger: leave it out for entries.")
         return
+    if options.best and not (options.only is None and options.to is None):
+        raise UsageError("--best shows all tasks and compares nothing: leave out --task and --to.")
     if options.files:
         raise UsageError("Entries and a --ledger do not belong into one table: name the one or the other.")
     if options.l2rpn:
@@ -181,11 +186,12 @@ def _check_what_is_ranked(options: argparse.Namespace) -> None:
 def _table(options: argparse.Namespace, output: Output) -> int:
     _check_what_is_ranked(options)
     if options.ledger is not None:
+        from rl2grid.analysis.ledger_overview import overview_table
         from rl2grid.analysis.ledger_table import ledger_table
 
         task = None if options.only is None else find_task(options.only).id
         tests = read_ledger(options.ledger)
-        output.text(ledger_table(tests, task, options.to))
+        output.text(overview_table(tests) if options.best else ledger_table(tests, task, options.to))
         output.results(tests=[asdict(test) for test in tests.values()])
         return 0
     from rl2grid.analysis.result_tables import entry_table

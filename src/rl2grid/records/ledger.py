@@ -91,6 +91,11 @@ class HashedTest:
         return f"{self.player} + {self.heuristic}" if self.heuristic else self.player
 
     @property
+    def has_learned(self) -> bool:
+        """Whether a policy was played; of those of the package, the ledger tells no training."""
+        return bool(self.training) or "policy_hash" in self.configuration
+
+    @property
     def choice(self) -> str:
         """See :func:`choice_hash`."""
         return choice_hash(self.configuration)

@@ -1,0 +1,66 @@
+"""The ledger of test results at a glance: the best of each kind of agent on every task that was played."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from rl2grid.analysis.ledger_table import LedgerRow, ledger_rows
+from rl2grid.analysis.table import markdown_row
+from rl2grid.envs.tasks import all_tasks, short_id
+from rl2grid.records.ledger import HashedTest
+from rl2grid.records.statistics import estimate
+
+KINDS = ("do nothing", "search and rules", "planner", "learned")
+"""What agents are told apart by: nothing is ever done; no training, but a model of the grid or a rule; learned."""
+USUAL_MONTHS = 500
+"""Of the test list; a cell says the number where fewer were played."""
+
+
+def overview_table(results: Mapping[str, HashedTest]) -> str:
+    """The highest mean survival of each kind of agent, as Markdown, a row per task; the best of a row is bold.
+
+    Args:
+        results: of a ledger.
+    """
+    by_task: dict[str, list[LedgerRow]] = {}
+    for row in ledger_rows(results, results):
+        by_task.setdefault(row.first.task, []).append(row)
+    order = {task: place for place, task in enumerate(all_tasks())}
+    lines = [markdown_row(["task", *KINDS]), "|:--|" + ":--|" * len(KINDS)]
+    for task in sorted(by_task, key=lambda one: order.get(one, len(order))):
+        best = [_best([row for row in by_task[task] if _kind(row.first) == kind]) for kind in KINDS]
+        highest = max(_survival(row) for row in best if row is not None)
+        lines.append(markdown_row([short_id(task), *(_cell(row, highest) for row in best)]))
+    return "\n".join(lines)
+
+
+def _kind(result: HashedTest) -> str:
+    if result.has_learned:
+        return "learned"
+    if result.agent == "planner":
+        return "planner"
+    return "do nothing" if result.label == "do-nothing" else "search and rules"
+
+
+def _best(rows: Sequence[LedgerRow]) -> LedgerRow | None:
+    return max(rows, key=_survival, default=None)
+
+
+def _survival(row: LedgerRow) -> float:
+    return float(estimate(row.scores("survival")).value)
+
+
+def _cell(row: LedgerRow | None, highest: float) -> str:
+    if row is None:
+        return ""
+    survival = f"{_survival(row):.3f}"
+    shown = f"**{survival}**" if _survival(row) == highest else survival
+    label = "" if row.first.label in ("do-nothing", "planner") else f" {row.first.label}"
+    return shown + label + (f" ({', '.join(_remarks(row))})" if _remarks(row) else "")
+
+
+def _remarks(row: LedgerRow) -> list[str]:
+    """How many trainings, and how many months where these are not all of the list."""
+    number, months = len(row.results), int(row.first.months["number"])
+    trainings = [f"{number} training{'s' if number > 1 else ''}"] if row.first.training else []
+    return [*trainings, *([f"{months} months"] if months != USUAL_MONTHS else [])]
