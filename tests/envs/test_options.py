@@ -180,3 +180,11 @@ def test_tasks_and_options_travel_to_other_processes_and_are_keys():
     assert pickle.loads(pickle.dumps((task, options))) == (task, options)
     assert {task: 1, options: 2} == {find_task(task.id): 1, options: 2}
     assert find_task(task) is task
+
+
+@pytest.mark.parametrize(
+    ("given", "kept"), [("attacks,calendar", "calendar,attacks"), ("trips,security,attacks,calendar", "all")]
+)
+def test_the_same_features_are_the_same_option(given: str, kept: str):
+    assert TaskOptions(operator_features=given) == TaskOptions(operator_features=kept)
+    assert TaskOptions(operator_features=given).operator_features == kept

@@ -15,7 +15,7 @@ from rl2grid.engines import DISPATCHES, ENGINES, HEURISTICS
 from rl2grid.envs.tasks import Task, constraint_of
 from rl2grid.errors import UsageError, one_of
 from rl2grid.mdp.constraint_table import CONSTRAINTS
-from rl2grid.mdp.features import operator_groups
+from rl2grid.mdp.features import ALL_GROUPS, operator_groups
 from rl2grid.scenarios.episodes import MAX_STEPS
 from rl2grid.scenarios.splits import SPLITS
 
@@ -31,6 +31,14 @@ def _one_of(*choices: str | None) -> dict[str, Any]:
 def _refuse_no_discount(value: object) -> None:
     if value is not None and not (isinstance(value, int | float) and 0 <= value <= 1):
         raise UsageError(f"gamma={value!r} is not allowed: give a discount between 0 and 1, or None.")
+
+
+def _in_order(operator_features: str | None) -> str | None:
+    """The groups in their order, or that they are all."""
+    if operator_features is None:
+        return None
+    groups = operator_groups(operator_features)
+    return ALL_GROUPS if groups == operator_groups(ALL_GROUPS) else ",".join(groups)
 
 
 def _refuse_no_length(value: object) -> None:
@@ -89,6 +97,8 @@ class TaskOptions:
     def __post_init__(self) -> None:
         for option in fields(self):
             _check(option, getattr(self, option.name))
+        # One text for one set of features: configurations and identities of results are compared as texts.
+        object.__setattr__(self, "operator_features", _in_order(self.operator_features))
 
 
 OBSERVED_WITH: tuple[str, ...] = ("normalize", "operator_features")
