@@ -183,6 +183,14 @@ def test_only_the_latest_expanded_months_are_kept_and_mapped_ones_stay_readable(
     assert first.load_p.sum() == total
 
 
+def test_expanded_months_give_way_where_little_is_free(made, monkeypatch) -> None:
+    monkeypatch.setattr(generated, "MONTHS_BETWEEN_CLEANUPS", 1)
+    load_scenario("bus14", "generated/17-03")
+    monkeypatch.setattr(generated, "free_bytes", lambda: generated.LEFT_FREE_BYTES - 1)
+    load_scenario("bus14", "generated/17-04")
+    assert not [path for path in (data_folder() / "series").rglob("generated.17-03-*") if path.is_file()]
+
+
 def test_months_to_remove_are_looked_for_when_some_were_expanded_not_at_every_episode(made, monkeypatch) -> None:
     looked: list[int] = []
     monkeypatch.setattr(generated, "_remove_oldest", lambda paths, limit: looked.append(len(paths)))

@@ -104,3 +104,10 @@ def test_training_years_are_made_ahead_a_year_at_a_time() -> None:
     assert list(make_packs(BUS14, [(seed, 3), (seed, 4)], workers=1)) == [0, 1, 2]
     assert is_year_there(BUS14, seed)
     assert list(make_packs(BUS14, [(seed, 5)], workers=1)) == [1]
+
+
+def test_months_that_do_not_fit_are_refused_before_any_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(making, "free_bytes", lambda: 10**6)
+    with pytest.raises(UsageError, match=r"^20 months of bus14 are still to be made and take up to 2 MB in .*1 MB are"):
+        next(make_packs(BUS14, [(seed, 0) for seed in range(910, 930)]))
+    assert not any(making.is_stored(BUS14, seed, 0) for seed in range(910, 930))

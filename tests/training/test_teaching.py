@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import shutil
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -266,8 +265,7 @@ def test_the_public_function_returns_the_folder(tmp_path: Path):
 def test_a_library_without_room_is_refused_before_anything_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("RL2GRID_DATA", str(tmp_path / "data"))
     (tmp_path / "data").mkdir()
-    usage = shutil.disk_usage(tmp_path)
-    monkeypatch.setattr("rl2grid.scenarios.training_years.shutil.disk_usage", lambda path: usage._replace(free=10**8))
+    monkeypatch.setattr("rl2grid.scenarios.training_years.free_bytes", lambda: 10**8)
     with pytest.raises(UsageError, match="are free: free some"):
         rl2grid.teach("greedy", "bus14-T0", months=1, output=tmp_path / "labels")
     assert not (tmp_path / "labels").exists()

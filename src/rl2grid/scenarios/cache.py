@@ -21,6 +21,7 @@ import glob
 import hashlib
 import json
 import os
+import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -58,6 +59,14 @@ class CachedSeries:
 def data_folder() -> Path:
     """Where series are kept: ``$RL2GRID_DATA``, else the user's cache folder of this system."""
     return Path(os.environ.get("RL2GRID_DATA") or platformdirs.user_cache_dir("rl2grid")).expanduser()
+
+
+def free_bytes() -> int:
+    """What is free where the data folder is, or will be."""
+    folder = data_folder().absolute()
+    while not folder.exists():
+        folder = folder.parent
+    return shutil.disk_usage(folder).free
 
 
 def series_folder(grid_id: str) -> Path:

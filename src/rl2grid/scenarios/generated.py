@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
-from rl2grid.scenarios.cache import FORMAT_VERSION, CachedSeries, cached_series, data_folder
+from rl2grid.scenarios.cache import FORMAT_VERSION, CachedSeries, cached_series, data_folder, free_bytes
 from rl2grid.scenarios.fingerprint import generator_fingerprint
 from rl2grid.scenarios.folder import FolderContent
 from rl2grid.scenarios.month_names import Months, month_name, parse_months
@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
 EXPANDED_BYTES = 8 * 2**30
 """Expanded generated months beyond this are removed, oldest first; they are expanded again when needed."""
+LEFT_FREE_BYTES = 2**30
+"""So are those without which less than this would be free: more than the largest grid's take until the next cleanup."""
 MONTHS_BETWEEN_CLEANUPS = 50
 """A process looks for months to remove after the first one that it expands, then each time after so many more: to look
 at thousands of files takes longer than to play an episode."""
@@ -208,14 +210,14 @@ def _remove_leftovers(folder: Path, seed: int) -> None:
 
 
 def _remove_oldest(paths: list[Path], limit: int) -> None:
-    """Remove files, the latest excepted, until the rest takes at most ``limit`` bytes."""
+    """Remove files, the latest excepted, until the rest takes at most ``limit`` bytes and some are free."""
     status = []
     for path in paths:
         try:
             status.append((path.stat().st_mtime_ns, path.stat().st_size, path))
         except FileNotFoundError:
             continue  # Another process was faster.
-    excess = sum(size for _, size, _ in status) - limit
+    excess = max(sum(size for _, size, _ in status) - limit, LEFT_FREE_BYTES - free_bytes())
     for _, size, path in sorted(status)[:-1]:
         if excess <= 0:
             return

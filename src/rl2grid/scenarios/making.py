@@ -18,12 +18,14 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
+import numpy as np
+
 from rl2grid import compile_notices
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid, System, find_system
 from rl2grid.grids.systems import add_system
 from rl2grid.processes import kill, take_standard_streams
-from rl2grid.scenarios.cache import data_folder
+from rl2grid.scenarios.cache import data_folder, free_bytes
 from rl2grid.scenarios.generated import is_stored, make_months
 from rl2grid.scenarios.month_names import MONTHS
 from rl2grid.scenarios.splits import TRAINING_SEEDS
@@ -33,6 +35,8 @@ MAKERS = "RL2GRID_MAKERS"
 one per core but one, and at least one."""
 FEW_YEARS = 6
 """So many are made sooner by one process than others have started."""
+PACKED = 4
+"""A pack takes less than one of so many parts of its integers; a sixth was measured."""
 
 _MAKER = "from rl2grid.scenarios.making import main; main()"
 """Not :mod:`multiprocessing`, which would import the caller's script again."""
@@ -74,7 +78,7 @@ def make_library_beside(grid: Grid) -> None:
 @functools.lru_cache(maxsize=64)
 def _make_beside(grid: Grid, data: Path) -> None:
     missing = _MissingYears(grid)
-    number = _number_of_makers()
+    number = number_of_makers()
     if not number or not missing:
         return
     ignored: queue.SimpleQueue[int | str] = queue.SimpleQueue()  # who plays the year will meet what is wrong
@@ -83,7 +87,12 @@ def _make_beside(grid: Grid, data: Path) -> None:
         atexit.register(_Maker(system, missing, ignored, _IDLE_MAKER, quiet).stop)
 
 
-def _number_of_makers() -> int:
+def number_of_makers() -> int:
+    """How many processes make the library beside a training.
+
+    Raises:
+        UsageError: what :data:`MAKERS` says is no number.
+    """
     given = os.environ.get(MAKERS)
     if given is None:
         return max((os.cpu_count() or 1) - 1, 1)
@@ -123,10 +132,11 @@ def make_packs(grid: Grid, months: Iterable[tuple[int, int]], workers: int | Non
         How many months there are now, of those asked for.
 
     Raises:
-        UsageError: the data folder cannot be written, or a process could not make its months.
+        UsageError: the data folder cannot be written or has no room, or a process could not make its months.
     """
     asked = sorted(set(months))
     missing = [month for month in asked if not is_stored(grid, *month)]
+    _check_room(grid, sum(seed not in TRAINING_SEEDS for seed, _ in missing))
     done = len(asked) - len(missing)
     yield done
     seeds = dict.fromkeys(seed for seed, _ in missing)
@@ -136,6 +146,22 @@ def make_packs(grid: Grid, months: Iterable[tuple[int, int]], workers: int | Non
     for made in _made_here(grid, years) if min(workers, len(years)) <= 1 else _made_elsewhere(grid, years, workers):
         done += made
         yield done
+
+
+def _check_room(grid: Grid, missing: int) -> None:
+    """Refuse months that do not fit, before any is made; years of the library are looked at where they are made."""
+    if not missing:
+        return
+    from rl2grid.scenarios.generator.calendar import MONTH_ROWS  # where it is needed, as the generator is
+
+    needed = missing * MONTH_ROWS * (2 * grid.n_load + grid.n_gen) * np.dtype(np.int16).itemsize // PACKED
+    free = free_bytes()
+    if needed > free:
+        raise UsageError(
+            f"{missing} months of {grid.id} are still to be made and take up to {needed / 1e6:,.0f} MB in "
+            f"{data_folder()}, where {free / 1e6:,.0f} MB are free: free some, or set RL2GRID_DATA to a folder with "
+            "more room."
+        )
 
 
 def _made_here(grid: Grid, years: list[Year]) -> Iterator[int]:

@@ -8,7 +8,6 @@ made when an episode first plays it. Forecasts are made for the rows in which so
 from __future__ import annotations
 
 import functools
-import shutil
 import threading
 from dataclasses import dataclass
 from datetime import datetime
@@ -22,7 +21,7 @@ from rl2grid.arrays import F32, I16
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
 from rl2grid.handles import Handle
-from rl2grid.scenarios.cache import cached_series, data_folder, is_cached
+from rl2grid.scenarios.cache import cached_series, data_folder, free_bytes, is_cached
 from rl2grid.scenarios.fingerprint import generator_fingerprint
 from rl2grid.scenarios.folder import FolderContent
 from rl2grid.scenarios.generator.calendar import MONTH_STEPS, month_and_row, month_start
@@ -196,7 +195,7 @@ def _file(seed: int) -> str:
 def _check_room(grid: Grid, data: Path) -> None:
     """Refuse a library that does not fit, before any of what is missing is written."""
     missing = sum(not is_year_there(grid, seed) for seed in TRAINING_SEEDS) * year_bytes(grid)
-    free = shutil.disk_usage(data).free
+    free = free_bytes()
     if missing > free:
         raise UsageError(
             f"The library of training months of {grid.id} takes {_gigabytes(TRAINING_YEARS * year_bytes(grid))} in "

@@ -42,6 +42,7 @@ from rl2grid.records import logs
 from rl2grid.records.locks import LockedError, locked
 from rl2grid.records.trainings import RUN_FILE, create_run_folder
 from rl2grid.records.versions import processor
+from rl2grid.scenarios.making import number_of_makers
 from rl2grid.training.energy import EnergyAccount
 from rl2grid.training.interrupts import stop_requests
 from rl2grid.training.limits import TimeLimit
@@ -64,7 +65,12 @@ UNLIMITED = TimeLimit(None)
 
 
 def make_envs(args: RunArgs) -> VectorEnvironment:
-    """The training environments of a run; those of joint tasks flattened as the algorithm needs them."""
+    """The training environments of a run; those of joint tasks flattened as the algorithm needs them.
+
+    Raises:
+        UsageError: the request cannot be met.
+    """
+    number_of_makers()  # a setting that is refused is refused here, before there is a run folder
     register_all()
     envs: Any = gymnasium.make_vec(
         args.task.id,
