@@ -38,3 +38,16 @@ def test_runs_that_play_alike_are_no_further_attempts():
     low, high = share_intervals(runs)
     assert low < 0.05
     assert high > 0.9
+
+
+@pytest.mark.parametrize("runs", [1, 5])
+def test_months_that_are_seldom_lost_are_in_the_interval(runs):
+    """19 of 20 months are completed: few or none of those that are not was seen."""
+    random = np.random.default_rng(runs)
+    shape = (1500, 1, 20)
+    months = 1.6 + 0.3 * random.normal(size=shape)
+    table = np.clip(months + 0.2 * random.normal(size=(1500, runs, 20)), 0, 1)
+    values = stats.norm.ppf((np.arange(100_000) + 0.5) / 100_000, 1.6, np.hypot(0.3, 0.2))
+    low, high = share_intervals(table[..., None])
+    held = (low <= np.clip(values, 0, 1).mean()) & (np.clip(values, 0, 1).mean() <= high)
+    assert 0.9 <= held.mean() <= 0.98

@@ -19,8 +19,10 @@ def test_one_run_has_the_variance_of_its_months():
     x = table(1, 30)
     spread = crossed_spread(x[0], [x])
     assert spread.variance == pytest.approx(stats.sem(x[0]) ** 2, rel=EXACT)
-    assert spread.freedom == 29
-    assert two_sided_p(x.mean(), spread) == pytest.approx(stats.ttest_1samp(x[0], 0).pvalue, rel=1e-9)
+    assert spread.normal_freedom == 29
+    assert two_sided_p(x.mean(), spread._replace(freedom=spread.normal_freedom)) == pytest.approx(
+        stats.ttest_1samp(x[0], 0).pvalue, rel=1e-9
+    )
     assert t_quantile(29, 0.95) == pytest.approx(stats.t.ppf(0.975, 29), rel=1e-9)
 
 
@@ -36,7 +38,19 @@ def test_variance_components_are_those_of_the_simulation():
     truth = 0.7**2 / 4 + 0.5**2 / 12 + 0.9**2 / 48
     assert spread.variance.mean() == pytest.approx(truth, rel=0.03)
     assert x.mean(axis=(1, 2)).var() == pytest.approx(truth, rel=0.08)
-    assert ((spread.freedom >= 3) & (spread.freedom <= 14)).all()
+    assert ((spread.normal_freedom >= 3) & (spread.normal_freedom <= 14)).all()
+    assert ((spread.freedom >= 1) & (spread.freedom <= spread.normal_freedom)).all()
+
+
+def test_few_months_that_differ_leave_few_degrees_of_freedom():
+    n = 20
+    calm, rare = np.random.default_rng(2).uniform(size=n), np.ones(n)
+    assert crossed_spread(calm, [calm[None]]).freedom == n - 1
+    rare[0] = 0.7
+    kurtosis = stats.kurtosis(rare, fisher=False, bias=False)
+    spread = crossed_spread(rare, [rare[None]])
+    assert spread.freedom == pytest.approx(2 * n / (kurtosis - (n - 3) / (n - 1)), rel=1e-9)
+    assert spread.normal_freedom == n - 1
 
 
 @pytest.mark.parametrize("runs", [3, 5, 10])

@@ -68,13 +68,14 @@ def kaplan_meier(lived: Lifetimes, *, level: float = LEVEL) -> SurvivalCurve:
         greenwood = np.concatenate(([0.0], np.cumsum(lost / (at_risk * (at_risk - lost)))))
     independent = np.where(alive > 0, alive**2 * np.where(alive > 0, greenwood, 0.0), 0.0)
     steps = np.concatenate(([0.0], falls))
-    effect, freedom = _design_effect(lived, steps)
-    low, high = score_interval(alive, Spread(independent * effect, freedom), lived.steps.shape[1], level=level)
+    effect, spread = _design_effect(lived, steps)
+    spread = spread._replace(variance=independent * effect)
+    low, high = score_interval(alive, spread, lived.steps.shape[1], level=level)
     return SurvivalCurve(steps, alive, low, high, lived.steps[~lived.failed])
 
 
-def _design_effect(lived: Lifetimes, steps: F64) -> tuple[F64, F64]:
-    """How many times the variance of independent lives there is after each step, and its degrees of freedom."""
+def _design_effect(lived: Lifetimes, steps: F64) -> tuple[F64, Spread]:
+    """How many times the variance of independent lives there is after each step, and the spread that shows it."""
     lives = ((lived.steps > steps[:, None, None, None]) | ~lived.failed).astype(np.float64)
     table = lives.mean(axis=-1)
     by_month = table.mean(axis=-2)
@@ -82,4 +83,4 @@ def _design_effect(lived: Lifetimes, steps: F64) -> tuple[F64, F64]:
     spread = crossed_spread(by_month, [table])
     independent = share * (1 - share) / n
     is_seen = independent > 0
-    return np.where(is_seen, spread.variance / np.where(is_seen, independent, 1.0), 1.0), spread.freedom
+    return np.where(is_seen, spread.variance / np.where(is_seen, independent, 1.0), 1.0), spread

@@ -46,7 +46,12 @@ def score_interval(value: ArrayLike, spread: Spread, months: int, *, level: floa
         return wilson_interval(share, 1.0, level=level)
     is_seen = (spread.variance > 0) & (share > 0) & (share < 1)
     n = np.where(is_seen, 1 + share * (1 - share) / np.where(is_seen, spread.variance, 1.0), float(months))
-    n = n * (t_quantile(months - 1, level) / t_quantile(spread.freedom, level)) ** 2
+    seen, normal = (
+        n * (t_quantile(months - 1, level) / t_quantile(np.where(is_seen, freedom, months - 1.0), level)) ** 2
+        for freedom in (spread.freedom, spread.normal_freedom)
+    )
+    # Nothing between 0 and 1 varies more than a share, whose variance is known with the share itself.
+    n = np.maximum(seen, np.minimum(normal, months))
     low, high = wilson_interval(share * n, n, level=level)
     return np.where(share == 0, 0.0, low), np.where(share == 1, 1.0, high)
 

@@ -135,7 +135,7 @@ def estimate(
     samples = means if is_mean else resampled(scores, aggregate, resamples)
     if scores.bounds == UNIT:
         share = samples.var() / means.var() if means.var() > 0 else 1.0
-        return bounded(value, Spread(spread.variance * share, spread.freedom), scores.months, level)
+        return bounded(value, spread._replace(variance=spread.variance * share), scores.months, level)
     return stretched(value, samples, means, spread, scores.bounds, level)
 
 

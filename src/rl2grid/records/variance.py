@@ -7,7 +7,8 @@ Runs and months are crossed: every run plays every month. A value is
 so that the mean over R runs and M months has the variance var(run) / R + var(month) / M + var(run x month) / (R M). The
 two last terms together are what the means of the months vary, divided by M; the first is estimated by the mean squares
 of an analysis of variance, and 0 where that would be negative. The degrees of freedom are Satterthwaite's (1946): few
-runs that vary leave few. ``benchmarks/intervals.py`` shows what intervals with these quantiles cover.
+runs that vary leave few. So do few months that differ from all others: their variance has O'Neill's (2014, Some useful
+moment results in sampling problems). ``benchmarks/intervals.py`` shows what intervals with these quantiles cover.
 """
 
 from __future__ import annotations
@@ -29,6 +30,9 @@ class Spread(NamedTuple):
 
     variance: F64
     freedom: F64
+    """What Student's t takes."""
+    normal_freedom: F64
+    """What it would take if the means of months were normal, at least as much."""
 
 
 def crossed_spread(by_month: F64, tables: Sequence[F64]) -> Spread:
@@ -41,18 +45,41 @@ def crossed_spread(by_month: F64, tables: Sequence[F64]) -> Spread:
     months = by_month.shape[-1]
     if months < 2:
         unknown = np.full(by_month.shape[:-1], np.nan)
-        return Spread(unknown, unknown)
+        return Spread(unknown, unknown, unknown)
     of_months = by_month.var(axis=-1, ddof=1) / months
-    variance, squares = of_months, of_months**2 / (months - 1)
+    variance, of_runs = of_months, np.zeros(of_months.shape)
     for table in tables:
         if table.shape[-2] > 1:
             part, whole = _run_part(table)
             variance = variance + part
-            squares = squares + np.where(part > 0, whole, 0.0) ** 2 / (table.shape[-2] - 1)
-    # Without any spread there is nothing whose freedom could be missing; with some, the fewest runs have theirs.
-    freedom = np.where(squares > 0, variance**2 / np.where(squares > 0, squares, 1.0), months - 1.0)
-    freedom = np.maximum(freedom, min([months, *(table.shape[-2] for table in tables if table.shape[-2] > 1)]) - 1)
-    return Spread(np.asarray(variance), freedom)
+            of_runs = of_runs + np.where(part > 0, whole, 0.0) ** 2 / (table.shape[-2] - 1)
+    seen, normal = (
+        _satterthwaite(variance, of_months**2 / freedom + of_runs, months - 1.0)
+        for freedom in (_freedom_of_months(by_month), months - 1.0)
+    )
+    # The fewest runs have theirs.
+    normal = np.maximum(normal, min([months, *(table.shape[-2] for table in tables if table.shape[-2] > 1)]) - 1)
+    return Spread(np.asarray(variance), np.clip(seen, 1.0, normal), normal)
+
+
+def _satterthwaite(variance: F64, squares: F64, most: float) -> F64:
+    """Degrees of freedom of a sum; ``most`` where there is no spread whose freedom could be missing."""
+    return np.asarray(np.where(squares > 0, variance**2 / np.where(squares > 0, squares, 1.0), most))
+
+
+def _freedom_of_months(by_month: F64) -> F64:
+    """Degrees of freedom of the variance of some months, from their kurtosis, unbiased as SciPy's; float64 [...]."""
+    n = by_month.shape[-1]
+    if n < 4:
+        return np.full(by_month.shape[:-1], n - 1.0)
+    deviations = by_month - by_month.mean(axis=-1, keepdims=True)
+    square = (deviations**2).mean(axis=-1)
+    excess = (deviations**4).mean(axis=-1) / np.where(square > 0, square, 1.0) ** 2 - 3.0
+    kurtosis = 3.0 + (n - 1) / ((n - 2) * (n - 3)) * ((n + 1) * excess + 6.0)
+    above = kurtosis - (n - 3) / (n - 1)
+    # Lighter tails than a normal distribution's are not taken for knowledge.
+    freedom = np.minimum(2 * n / np.where(above > 0, above, 1.0), n - 1)
+    return np.asarray(np.where((square > 0) & (above > 0), freedom, n - 1.0), np.float64)
 
 
 def t_quantile(freedom: ArrayLike, level: float) -> F64:
