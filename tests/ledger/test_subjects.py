@@ -143,7 +143,7 @@ def test_what_differs_is_named(played, tmp_path: Path, capsys):
     (stored,) = contents.values()
     del stored["checksum"]
     stored["episodes_hash"] = "0" * 16
-    stored["test"]["survival"][0] += 0.0001
+    stored["test"]["survival"] += 0.0001
     ledger.write_text(json.dumps(contents))
     assert main(["leaderboard", "verify", *words]) == 1
     assert "differs in episodes_hash, test." in capsys.readouterr().out

@@ -44,7 +44,7 @@ def draw_ledger(results: Mapping[str, HashedTest], task: str, *, theme: Theme = 
             axes.plot([survival.low, survival.high], [place, place], color=colour, linewidth=2, alpha=0.55)
             axes.plot(survival.value, place, marker="o", color=colour, markersize=6)
             if row.first.training and len(row.results) > 1:
-                each = [one.test["survival"][0] for one in row.results]
+                each = [one.test["survival"] for one in row.results]
                 axes.plot(each, [place] * len(each), linestyle="", marker="|", color=colour, markersize=9)
         axes.set_yticks(range(len(found)), names)
         axes.set(xlim=(0, 1.01), ylim=(-0.6, len(found) - 0.4), xlabel="Share of the month survived")

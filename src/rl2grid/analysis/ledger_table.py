@@ -228,7 +228,7 @@ def _months(result: HashedTest) -> str:
 
 def _survival(row: LedgerRow) -> list[str]:
     """Of the best policies, and of the last."""
-    each = [result.test["survival"][0] for result in row.results]
+    each = [result.test["survival"] for result in row.results]
     best = with_interval(estimate(row.scores("survival")), 3)
     last = estimate(row.scores("survival", of_last=True)).value if any(one.last for one in row.results) else None
     return [best if len(each) == 1 else f"**{best}** of {_seeds(each, '.3f')}", "" if last is None else f"{last:.3f}"]

@@ -9,7 +9,6 @@ is an entry of a leaderboard, :mod:`rl2grid.records.entries`. What the order say
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -18,7 +17,6 @@ from typing import Any
 from rl2grid.records.evaluations import Evaluation, identity_hash
 from rl2grid.records.files import CHECKSUM, checksum, misfit, not_what, read_json, write_json
 from rl2grid.records.month_values import pack_months
-from rl2grid.records.statistics import Estimate
 
 _REMEDY = "give a file that 'rl2grid leaderboard test' wrote, or one that does not exist yet"
 _TEST = {
@@ -26,7 +24,7 @@ _TEST = {
     "training": dict,
     "identity_hash": str,
     "episodes_hash": str,
-    "test": {"episodes": int},
+    "test": {"episodes": int, "survival": float},
     "months": dict,
 }
 STARTED_FROM = "started_from"
@@ -50,7 +48,7 @@ class HashedTest:
     episodes_hash: str
     """Of what must be equal wherever the episodes are played."""
     test: Mapping[str, Any]
-    """Number of episodes, and value, low and high end of each figure, rounded."""
+    """Number of episodes and each figure, rounded; intervals follow from :attr:`values` and are in no file."""
     months: Mapping[str, Any]
     """Which months: split, its version, that of the generator, number of months and of seeds."""
     values: Mapping[str, str]
@@ -140,7 +138,7 @@ def hashed_test(
     """
     rows = [[row.scenario, row.seed, row.grid_steps, row.decisions, row.episode_return] for row in evaluation.episodes]
     summary, identity = evaluation.summary, evaluation.identity
-    figures = {name: _interval(getattr(summary, name)) for name in _FIGURES}
+    figures = {name: round(getattr(summary, name).value, 4) for name in _FIGURES}
     made = HashedTest(
         configuration=dict(configuration),
         training=dict(training),
@@ -201,9 +199,3 @@ def add_test(path: Path, result: HashedTest) -> None:
     """Add a result to a ledger, or replace that of its configuration."""
     results = {**read_ledger(path), identity_hash(result.configuration): result}
     write_json(path, {digest: _stored(one) for digest, one in results.items()}, indent=1)
-
-
-def _interval(estimate: Estimate) -> list[float | None]:
-    """Value, low and high; JSON knows no NaN."""
-    values = (estimate.value, estimate.low, estimate.high)
-    return [None if math.isnan(value) else round(value, 4) for value in values]
