@@ -1,8 +1,9 @@
 """Measure what the scenario generator makes.
 
+``survival [GRID ...]`` prints, as a table, what doing nothing survived of the test months by the ledger,
 ``measure [GRID ...] --seeds N`` plays N generated months doing nothing, ``compare [GRID ...]`` sets generated against
 bundled series, ``outages [GRID ...]`` does so after the loss of each line that opponent or planned outages open,
-``unreachable [GRID ...]`` counts the outages whose overload no action brings below the limit; all write
+``unreachable [GRID ...]`` counts the outages whose overload no action brings below the limit; the last four write
 ``benchmarks/results/scenarios.json``. ``plot [GRID ...] --folder F`` draws a year.
 Seeds begin at 10,000: no split uses those.
 """
@@ -21,29 +22,37 @@ import numpy as np
 from calibration import FIRST_SEED, bundled, rounded
 from numpy.typing import NDArray
 
+from rl2grid.analysis.table import markdown_row, with_interval
 from rl2grid.arrays import F32, F64, I32
 from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.engines.native.entry import reset_one, step_one
 from rl2grid.engines.native.orders import write_order
 from rl2grid.engines.native.what_if import WhatIf, snapshot_of
+from rl2grid.envs.tasks import find_task
 from rl2grid.grids import GRID_IDS, Grid, find_system, load_grid
 from rl2grid.mdp.actions import DO_NOTHING, StepAction, level_catalogue, reconnect
 from rl2grid.mdp.opponents import draw_opponent
 from rl2grid.powerflow.batch import NOTHING, SWITCH, Changes, Snapshot
 from rl2grid.powerflow.model import load_network
+from rl2grid.records.ledger import read_ledger
+from rl2grid.records.month_values import unpack_months
 from rl2grid.records.statistics import UNIT, Scores, estimate, median_score
 from rl2grid.scenarios.generator import generate_month
 from rl2grid.scenarios.generator.calendar import MONTH_ROWS, MONTH_STEPS, MONTHS, ROWS_PER_DAY, ROWS_PER_HOUR
 from rl2grid.scenarios.generator.constants import Constants, load_constants
 from rl2grid.scenarios.generator.security import assess
 from rl2grid.scenarios.generator.year import generate_year
+from rl2grid.scenarios.library import list_scenarios
 from rl2grid.scenarios.maintenance import sample_outages
+from rl2grid.scenarios.month_names import parse_months
 from rl2grid.scenarios.scenario import Scenario
+from rl2grid.scenarios.splits import TEST
 from rl2grid.streams import Purpose, Stream
 
 KINDS = ("nuclear", "hydro", "thermal", "wind", "solar")
 
 RESULTS = Path(__file__).resolve().parent / "results" / "scenarios.json"
+LEDGER = RESULTS.with_name("baselines.json")
 OUTAGE_YEARS, UNREACHABLE_MONTHS = 12, 48
 """Generated years that are set against the bundled series after the loss of lines; months, each of a year of its own,
 whose outages are asked for what can be done about them."""
@@ -75,6 +84,19 @@ def survive(engine: NativeEngine, grid: Grid, seed: int, month: int) -> int:
         step_one(engine.address, 0)
         steps += not engine.state.terminated[0]
     return steps
+
+
+def tested(grid_id: str) -> str:
+    """A row of a Markdown table: months, mean and median with their intervals, mean of each season."""
+    tests = read_ledger(LEDGER).values()
+    (test,) = (one for one in tests if one.label == "do-nothing" and one.task == find_task(f"{grid_id}-T0").id)
+    values = unpack_months(test.values, 1)["survival"]
+    names = list_scenarios(grid_id, TEST)[: len(values)]
+    months = np.array([parse_months(name.removeprefix("generated/")).first for name in names])
+    scores = Scores(values[None], UNIT)
+    figures = (estimate(scores), estimate(scores, median_score))
+    seasons = (f"{values[np.isin(months, part)].mean():.2f}" for part in SEASON_MONTHS.values())
+    return markdown_row([grid_id, str(len(values)), *(with_interval(one, 3) for one in figures), *seasons])
 
 
 def measure(grid_id: str, seeds: int) -> dict[str, Any]:
@@ -376,13 +398,15 @@ def record(section: str, grid_id: str, value: dict[str, Any]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("command", choices=("measure", "compare", "outages", "unreachable", "plot"))
+    parser.add_argument("command", choices=("survival", "measure", "compare", "outages", "unreachable", "plot"))
     parser.add_argument("grids", nargs="*", default=list(GRID_IDS))
     parser.add_argument("--seeds", type=int, default=200)
     parser.add_argument("--folder", type=Path, default=Path("plots"))
     arguments = parser.parse_args()
     for grid_id in arguments.grids:
-        if arguments.command == "measure":
+        if arguments.command == "survival":
+            print(tested(grid_id))
+        elif arguments.command == "measure":
             record("difficulty", grid_id, measure(grid_id, arguments.seeds))
         elif arguments.command == "compare":
             record("realism", grid_id, compare(grid_id, min(arguments.seeds, 6)))
