@@ -92,7 +92,8 @@ def main() -> int:
     status = watch([*program, *(["--resume", str(folder)] if folder.exists() else new), "--quiet"], folder, samples)
     if status:
         return status
-    write_json(RESULTS, result(folder, samples, shlex.join(["rl2grid", "train", *new])), indent=1)
+    command = shlex.join(["rl2grid", "train", *(word if word != str(folder) else "FOLDER" for word in new)])
+    write_json(RESULTS, result(folder, samples, command), indent=1)
     return 0
 
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from rl2grid.records.shares import share_intervals, wilson_interval
+from rl2grid.records.shares import score_interval, share_intervals, wilson_interval
+from rl2grid.records.variance import Spread
 
 
 def test_wilsons_interval_is_the_textbooks():
@@ -51,3 +52,10 @@ def test_months_that_are_seldom_lost_are_in_the_interval(runs):
     low, high = share_intervals(table[..., None])
     held = (low <= np.clip(values, 0, 1).mean()) & (np.clip(values, 0, 1).mean() <= high)
     assert 0.9 <= held.mean() <= 0.98
+
+
+def test_few_runs_leave_doubt_of_a_figure_at_its_end():
+    three = Spread(np.array(0.01), np.array(2.0), np.array(2.0))
+    low, high = score_interval(1.0, three, 200)
+    assert high == 1.0
+    assert low < wilson_interval(50, 50)[0], "three runs that differ tell less than two hundred months"

@@ -47,7 +47,7 @@ def score_interval(value: ArrayLike, spread: Spread, months: int, *, level: floa
     is_seen = (spread.variance > 0) & (share > 0) & (share < 1)
     n = np.where(is_seen, 1 + share * (1 - share) / np.where(is_seen, spread.variance, 1.0), float(months))
     seen, normal = (
-        n * (t_quantile(months - 1, level) / t_quantile(np.where(is_seen, freedom, months - 1.0), level)) ** 2
+        n * (t_quantile(months - 1, level) / t_quantile(freedom, level)) ** 2
         for freedom in (spread.freedom, spread.normal_freedom)
     )
     # Nothing between 0 and 1 varies more than a share, whose variance is known with the share itself.
