@@ -375,3 +375,10 @@ def test_a_run_on_the_grid_broken_off_and_resumed_ends_like_one_that_was_not(
     resume(tmp_path / "run", evaluate=validate)
     assert_same_run(tmp_path / "run", straight)
     assert load_checkpoint(straight / "checkpoint.pt")["training"]["grid_steps"] > 4 * iteration
+
+
+def test_a_setting_that_is_wrong_is_refused_before_there_is_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("RL2GRID_MAKERS", "many")
+    with pytest.raises(UsageError, match="RL2GRID_MAKERS=many is no number of processes"):
+        train(request(tmp_path / "run"))
+    assert not (tmp_path / "run").exists()
