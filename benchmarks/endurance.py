@@ -31,15 +31,19 @@ MEMORY_GROWTH = 0.03
 """Share by which the resident memory may be larger at the end: what the allocator keeps varies so much."""
 
 
+def anonymous_bytes(process: Path) -> int:
+    """Memory of a process, given as its folder in ``/proc``, that is in no file."""
+    lines = (process / "smaps_rollup").read_text().splitlines()
+    return sum(int(line.split()[1]) for line in lines if line.startswith("Anonymous")) * 2**10
+
+
 def sample(data: Path) -> dict[str, int]:
     """What this process holds, and what its data folder takes."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
-    mapped = sum(int(line.split()[1]) for line in Path("/proc/self/smaps_rollup").read_text().splitlines()
-                 if line.startswith("Anonymous"))  # fmt: skip
     files = [path for folder in ("packs", "series") for path in (data / folder).rglob("*") if path.is_file()]
     return {
         "resident_mb": pages * os.sysconf("SC_PAGE_SIZE") // 2**20,
-        "anonymous_mb": mapped // 2**10,
+        "anonymous_mb": anonymous_bytes(Path("/proc/self")) // 2**20,
         "descriptors": len(os.listdir("/proc/self/fd")),
         "threads": threading.active_count(),
         "disk_mb": sum(path.stat().st_size for path in files) // 2**20,

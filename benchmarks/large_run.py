@@ -9,7 +9,6 @@ run in ``FOLDER``. Test months are not touched.
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import os
 import shlex
@@ -19,7 +18,10 @@ import time
 from pathlib import Path
 from typing import Any
 
+from endurance import anonymous_bytes
+
 from rl2grid.records.files import write_json
+from rl2grid.records.metrics import read_validations
 
 RESULTS = Path(__file__).resolve().parent / "results" / "large_run.json"
 SAMPLE_SECONDS = 60.0
@@ -29,12 +31,10 @@ SHOWN_SAMPLES = 40
 def sample(process: int, folder: Path) -> dict[str, float]:
     """What a training holds at this moment."""
     home = Path("/proc") / str(process)
-    mapped = sum(int(line.split()[1]) for line in (home / "smaps_rollup").read_text().splitlines()
-                 if line.startswith("Anonymous"))  # fmt: skip
     clock = (home / "stat").read_text().rpartition(")")[2].split()[11:13]
     return {
         "seconds": round(sum(map(int, clock)) / os.sysconf("SC_CLK_TCK"), 1),
-        "anonymous_mb": round(mapped / 2**10, 1),
+        "anonymous_mb": round(anonymous_bytes(home) / 2**20, 1),
         "descriptors": len(os.listdir(home / "fd")),
         "run_folder_mb": round(sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) / 2**20, 2),
     }
@@ -54,27 +54,19 @@ def watch(command: list[str], folder: Path, samples: Path) -> int:
         return training.returncode
 
 
-def curve(folder: Path, name: str) -> list[tuple[int, float]]:
-    """The values of a metric with the decisions after which they were written."""
-    with (folder / "metrics.csv").open(newline="") as file:
-        rows = [row for row in csv.DictReader(file) if row["name"] == name]
-    return [(int(row["step"]), round(float(row["value"]), 4)) for row in rows]
-
-
 def result(folder: Path, samples: Path, command: str) -> dict[str, Any]:
     """What is kept: samples evenly spaced over all processes, validations, and what the run took."""
     taken = [json.loads(line) for line in samples.read_text().splitlines()]
     step = max(len(taken) // SHOWN_SAMPLES, 1)
-    decisions = curve(folder, "charts/SPS")[-1][0]
+    validations = read_validations(folder)
     half = taken[len(taken) // 2 :]
     return {
         "command": command,
-        "decisions": decisions,
+        "decisions": max(validations),
         "samples_taken": len(taken),
         "second_half": {name: [min(one[name] for one in half), max(one[name] for one in half)] for name in half[0]},
         "samples": taken[::step],
-        "validation_survival": curve(folder, "validation/survival"),
-        "sps": curve(folder, "charts/SPS")[-1][1],
+        "validation_survival": [[step, round(values["survival"], 4)] for step, values in validations.items()],
         "energy": json.loads((folder / "energy.json").read_text()),
     }
 

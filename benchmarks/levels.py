@@ -67,9 +67,8 @@ def measure(grid_id: str, months: int, sets: Sets, heuristics: Sequence[str]) ->
         scores: dict[str, Scores] = {}
         for name, ids in sets.items():
             agent = DoNothing() if ids is None else Greedy(ids.tolist())
-            evaluation = evaluate(
-                agent, task, scenarios=scenarios, heuristic=None if heuristic == "none" else heuristic
-            )
+            asked = None if heuristic == "none" else heuristic
+            evaluation = evaluate(agent, task, scenarios=scenarios, heuristic=asked, workers=0)
             survival = np.array([episode.survival for episode in evaluation.episodes])
             scores[name] = Scores(survival[None, :, None])
             summary = evaluation.summary
@@ -83,7 +82,7 @@ def measure(grid_id: str, months: int, sets: Sets, heuristics: Sequence[str]) ->
             }
             if name.endswith(" before"):
                 row["gain"] = _gain(scores[name.removesuffix(" before")], scores[name])
-            elif name in ("level 2", "level 3", "level 4"):
+            elif "level 1" in scores and name != "level 1":
                 row["gain"] = _gain(scores[name], scores["level 1"])
             result["rows"].append(row)
             print(grid_id, json.dumps(row), flush=True)

@@ -42,7 +42,8 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     if page.file.src_uri not in PAGES:
         return markdown
     results = read_ledger(LEDGER)
-    return _MARK.sub(partial(_shown, results), markdown).replace(_OVERVIEW, overview_table(results))
+    shown = _MARK.sub(partial(_shown, results), markdown)
+    return shown.replace(_OVERVIEW, overview_table(results)) if _OVERVIEW in shown else shown
 
 
 def _shown(results: Mapping[str, HashedTest], mark: re.Match[str]) -> str:

@@ -8,7 +8,7 @@ from rl2grid.analysis.ledger_table import LedgerRow, ledger_rows
 from rl2grid.analysis.table import markdown_row
 from rl2grid.envs.tasks import all_tasks, short_id
 from rl2grid.records.ledger import HashedTest
-from rl2grid.records.statistics import estimate
+from rl2grid.records.statistics import aggregated
 
 KINDS = ("do nothing", "search and rules", "planner", "learned")
 """What agents are told apart by: nothing is ever done; no training, but a model of the grid or a rule; learned."""
@@ -47,7 +47,7 @@ def _best(rows: Sequence[LedgerRow]) -> LedgerRow | None:
 
 
 def _survival(row: LedgerRow) -> float:
-    return float(estimate(row.scores("survival")).value)
+    return aggregated(row.scores("survival"))
 
 
 def _cell(row: LedgerRow | None, highest: float) -> str:
@@ -56,7 +56,8 @@ def _cell(row: LedgerRow | None, highest: float) -> str:
     survival = f"{_survival(row):.3f}"
     shown = f"**{survival}**" if _survival(row) == highest else survival
     label = "" if row.first.label in ("do-nothing", "planner") else f" {row.first.label}"
-    return shown + label + (f" ({', '.join(_remarks(row))})" if _remarks(row) else "")
+    remarks = ", ".join(_remarks(row))
+    return shown + label + (f" ({remarks})" if remarks else "")
 
 
 def _remarks(row: LedgerRow) -> list[str]:
