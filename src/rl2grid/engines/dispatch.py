@@ -240,13 +240,14 @@ def rounded_sum(values: F32, size: int) -> np.float32:
         for k in range(size):
             total += values[k]
         return total
-    partial = np.empty(_UNROLLED, np.float32)
-    partial[:] = values[:_UNROLLED]
     whole = size - size % _UNROLLED
-    for k in range(_UNROLLED, whole):
-        partial[k % _UNROLLED] += values[k]
-    first_half = (partial[0] + partial[1]) + (partial[2] + partial[3])
-    total = first_half + ((partial[4] + partial[5]) + (partial[6] + partial[7]))
+    a, b, c, d, e, f, g, h = (
+        values[0], values[1], values[2], values[3], values[4], values[5], values[6], values[7]
+    )  # fmt: skip
+    for k in range(_UNROLLED, whole, _UNROLLED):
+        a, b, c, d = a + values[k], b + values[k + 1], c + values[k + 2], d + values[k + 3]
+        e, f, g, h = e + values[k + 4], f + values[k + 5], g + values[k + 6], h + values[k + 7]
+    total = ((a + b) + (c + d)) + ((e + f) + (g + h))
     for k in range(whole, size):
         total += values[k]
     return total

@@ -25,10 +25,9 @@ def update_excused(state: GridState, i: int) -> None:
     maintenance. Leaving it open from then on is the agent's choice.
     """
     for line in range(state.excused.shape[1]):
-        if state.attacked[i, line] or state.time_next_maintenance[i, line] == 0:
-            state.excused[i, line] = True
-        elif state.time_before_cooldown_line[i, line] == 0:
-            state.excused[i, line] = False
+        begins = state.attacked[i, line] | (state.time_next_maintenance[i, line] == 0)
+        lasts = state.excused[i, line] & (state.time_before_cooldown_line[i, line] != 0)
+        state.excused[i, line] = begins | lasts
 
 
 @jit
@@ -57,10 +56,8 @@ def tlo_cost(state: GridState, i: int) -> float:
         return 0.0
     count = 0
     for line in range(state.rho.shape[1]):
-        if state.excused[i, line]:
-            continue
-        if not state.line_status[i, line] or state.rho[i, line] > np.float32(1.0):
-            count += 1
+        lost = (not state.line_status[i, line]) | (state.rho[i, line] > np.float32(1.0))
+        count += lost & (not state.excused[i, line])
     return np.float64(count)
 
 

@@ -87,6 +87,7 @@ def _write_planned_and_stored(state: GridState, i: int, out: F32, begin: int) ->
 @jit
 def _write(row: NDArray[Any], out: F32, begin: int) -> int:
     size: int = row.shape[0]
+    part = out[begin : begin + size]
     for k in range(size):
-        out[begin + k] = np.float32(row[k])
+        part[k] = np.float32(row[k])
     return begin + size

@@ -54,6 +54,8 @@ from rl2grid.compile import jit
 from rl2grid.errors import UsageError
 from rl2grid.mdp.state import GridState
 
+_FULL_LOAD = np.float32(1.0)
+
 Components = tuple[float, float, float]
 """survive, overload, cost."""
 
@@ -93,8 +95,14 @@ def overload_component(state: GridState, i: int) -> float:
     """Overload of the ``default`` reward in row ``i``, in [-1, 0]; 0 at a game over."""
     if state.terminated[i]:
         return 0.0
-    total = 0.0
     n_lines: int = state.rho.shape[1]
+    # Most steps have neither, and only a sum of numbers has to be made in order.
+    any_at_all = False
+    for line in range(n_lines):
+        any_at_all |= (state.rho[i, line] > _FULL_LOAD) | (not state.line_status[i, line])
+    if not any_at_all:
+        return 0.0
+    total = 0.0
     for line in range(n_lines):
         excess = np.float64(state.rho[i, line]) - 1.0
         total -= min(max(excess, 0.0), 1.0) if state.line_status[i, line] else 1.0

@@ -45,8 +45,7 @@ def topology_score(state: GridState, i: int) -> float:
     """Minus the number of elements that are not on busbar 1 (disconnected ones included)."""
     if state.terminated[i]:
         return 0.0
-    total = 0.0
+    elsewhere = 0
     for element in range(state.topo_vect.shape[1]):
-        if state.topo_vect[i, element] != 1:
-            total -= 1.0
-    return total
+        elsewhere += state.topo_vect[i, element] != 1
+    return 0.0 - np.float64(elsewhere)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from rl2grid.arrays import F32
 from rl2grid.compile import jit
 from rl2grid.engines.dispatch import (
     NEGLIGIBLE,
@@ -140,22 +141,30 @@ def curtail(environments: Environments, i: int) -> None:
     """Hold renewables to their limits: lowers ``new_p``, notes the change of the curtailed power."""
     state, hidden = environments.state, environments.hidden
     new_p, before = hidden.new_p[i], state.gen_p_before_curtail[i]
+    is_limited = False
+    for gen in range(new_p.shape[0]):
+        if state.gen_renewable[gen]:
+            before[gen] = new_p[gen]
+            is_limited |= not abs(state.curtailment_limit[i, gen] - _FULL) < NEGLIGIBLE
+    curtailed = _hold_to_limits(state, i, new_p, before) if is_limited else _NONE
+    hidden.curtailment_change[i] = curtailed - hidden.curtailed[i]
+    hidden.curtailed[i] = curtailed
+
+
+@jit
+def _hold_to_limits(state: GridState, i: int, new_p: F32, before: F32) -> np.float32:
+    """Lower ``new_p`` [gen] to the limits; the change of the production, MW, 0 or negative."""
     limited = np.empty((2, new_p.shape[0]), np.float32)
     count = 0
     for gen in range(new_p.shape[0]):
-        if not state.gen_renewable[gen]:
-            continue
-        before[gen] = new_p[gen]
         limit = state.curtailment_limit[i, gen]
-        if abs(limit - _FULL) < NEGLIGIBLE:
+        if not state.gen_renewable[gen] or abs(limit - _FULL) < NEGLIGIBLE:
             continue
         new_p[gen] = min(state.gen_pmax[gen] * limit, new_p[gen])
         limited[0, count] = new_p[gen]
         limited[1, count] = before[gen]
         count += 1
-    curtailed = rounded_sum(limited[0], count) - rounded_sum(limited[1], count)
-    hidden.curtailment_change[i] = curtailed - hidden.curtailed[i]
-    hidden.curtailed[i] = curtailed
+    return rounded_sum(limited[0], count) - rounded_sum(limited[1], count)
 
 
 @jit

@@ -30,6 +30,7 @@ def observe(environments: Environments, i: int) -> None:
     )
     for line in range(state.rho.shape[1]):
         state.rho[i, line] = state.a_or[i, line] / state.thermal_limit[line]
+    for line in range(state.rho.shape[1]):
         state.line_status[i, line] = state.topo_vect[i, state.line_or_pos_topo_vect[line]] > 0
     _observe_generators(state, i)
 

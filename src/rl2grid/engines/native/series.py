@@ -157,16 +157,18 @@ def plan_outages(environments: Environments, i: int, step: int) -> None:
     The rows of :func:`rl2grid.scenarios.maintenance.maintenance_times`, one after the other.
     """
     state, hidden = environments.state, environments.hidden
-    for line in range(hidden.next_outage.shape[1]):
-        k = hidden.next_outage[i, line]
-        if k >= 0 and hidden.outage_end[i, k] <= step:
-            following = k + 1 < hidden.outage_count[i] and hidden.outage_line[i, k + 1] == line
-            k = k + 1 if following else -1
-            hidden.next_outage[i, line] = k
-        if k < 0:
-            state.time_next_maintenance[i, line] = -1
-            state.duration_next_maintenance[i, line] = 0
+    state.time_next_maintenance[i] = -1
+    state.duration_next_maintenance[i] = 0
+    for k in range(hidden.outage_count[i] - 1, -1, -1):
+        line = hidden.outage_line[i, k]
+        if hidden.next_outage[i, line] != k:
             continue
-        begin = hidden.outage_begin[i, k]
+        if hidden.outage_end[i, k] <= step:
+            is_followed = k + 1 < hidden.outage_count[i] and hidden.outage_line[i, k + 1] == line
+            hidden.next_outage[i, line] = k + 1 if is_followed else -1
+        following = hidden.next_outage[i, line]
+        if following < 0:
+            continue
+        begin = hidden.outage_begin[i, following]
         state.time_next_maintenance[i, line] = max(begin - step, 0)
-        state.duration_next_maintenance[i, line] = hidden.outage_end[i, k] - max(begin, step)
+        state.duration_next_maintenance[i, line] = hidden.outage_end[i, following] - max(begin, step)

@@ -83,10 +83,9 @@ def close_line(environments: Environments, i: int, line: int) -> None:
 @jit
 def remember_busbars(environments: Environments, i: int) -> None:
     """Note the busbar of every element that is on one."""
-    state, hidden = environments.state, environments.hidden
-    for element in range(state.topo_vect.shape[1]):
-        if state.topo_vect[i, element] > 0:
-            hidden.last_bus[i, element] = state.topo_vect[i, element]
+    busbar, last_bus = environments.state.topo_vect[i], environments.hidden.last_bus[i]
+    for element in range(busbar.shape[0]):
+        last_bus[element] = busbar[element] if busbar[element] > 0 else last_bus[element]
 
 
 @jit
