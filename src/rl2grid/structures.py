@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import enum
 import functools
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
@@ -45,6 +46,8 @@ class Role(enum.Enum):
     """No environment axis; of one thread, whose every call writes it before it reads it."""
 
 
+_CACHE_LINE = 64
+"""Bytes."""
 _SHARED = (Role.CONSTANT, Role.WORKSPACE)
 _SAVED = (Role.EPISODE, Role.ADDRESS, Role.KEPT)
 
@@ -178,10 +181,18 @@ def allocate(kind: type[Structure], sizes: Mapping[str, int], n: int = 0, /, **g
     for name, field in declaration_of(kind).fields.items():
         if name not in values:
             shape = tuple(axis if isinstance(axis, int) else sizes[axis] for axis in field.axes)
-            values[name] = np.zeros((n, *shape) if field.per_environment else shape, field.dtype)
+            values[name] = _zeros((n, *shape) if field.per_environment else shape, field.dtype)
     structure = kind(**values)
     check(structure)
     return structure
+
+
+def _zeros(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Zeros that begin where a line of the cache does, so that no SIMD register is filled from two of them."""
+    size = math.prod(shape) * dtype.itemsize
+    memory = np.zeros(size + _CACHE_LINE, np.uint8)
+    begin = -memory.ctypes.data % _CACHE_LINE
+    return memory[begin : begin + size].view(dtype).reshape(shape)
 
 
 def check(structure: tuple[Any, ...]) -> None:
@@ -225,7 +236,10 @@ def row_of(structure: Structure, i: int) -> Structure:
 
 def with_own_workspace(structure: Structure) -> Structure:
     """The same arrays with a workspace of its own, for another thread."""
-    own = {name: np.zeros_like(getattr(structure, name)) for name in fields_of(type(structure), Role.WORKSPACE)}
+    own = {
+        name: _zeros(getattr(structure, name).shape, field.dtype)
+        for name, field in fields_of(type(structure), Role.WORKSPACE).items()
+    }
     replaced: Structure = structure._replace(**own)  # type: ignore[attr-defined]
     return replaced
 
