@@ -6,21 +6,25 @@ import math
 
 import numpy as np
 
-from rl2grid.arrays import F32, F64, I32, U16, Index
+from rl2grid.arrays import F32, F64, I32, U16
 from rl2grid.compile import borrowing_jit, owning_jit
 from rl2grid.powerflow.flow_state import ABSENT, Equations, Factors, FlowState, forget_flow, new_flow_state
+from rl2grid.powerflow.lanes import root, where_less
 from rl2grid.powerflow.model import Network
-from rl2grid.powerflow.newton import solve_cold, solve_warm
+from rl2grid.powerflow.newton import may_go_on, solve_cold, solve_warm
 from rl2grid.powerflow.topology import build_nodes, is_same_topology, measure_pattern, remember_topology, write_pattern
 
 __all__ = [
     "CONVERGED",
     "DISCONNECTED",
     "DIVERGED",
+    "PREPARED",
     "FlowState",
     "forget_flow",
     "new_flow_state",
+    "prepare_flow",
     "run_flow",
+    "solve_flow",
     "write_currents",
     "write_flow",
 ]
@@ -31,6 +35,8 @@ DISCONNECTED = 1
 """A load, generator or working storage is disconnected, or a bus is not connected to the slack generator's."""
 DIVERGED = 2
 """LightSim2Grid's recipe finds no solution, or generators on one bus have different set-points."""
+PREPARED = 3
+"""Nothing speaks against solving it."""
 _SETPOINT_TOLERANCE = 1e-7
 """Per unit, as LightSim2Grid."""
 _LOWEST_KILOVOLT = 1e-7
@@ -67,12 +73,32 @@ def run_flow(
         :data:`CONVERGED`, :data:`DISCONNECTED` or :data:`DIVERGED`; only after the first do the voltages mean
         anything.
     """
-    columns, values = np.int64(0), np.int64(0)
+    status = prepare_flow(network, flow, i, topo_vect, gen_p, gen_v, load_p, load_q, storage_p)
+    return solve_flow(network, flow, i, topo_vect, gen_v) if status == PREPARED else status
+
+
+@borrowing_jit
+def prepare_flow(
+    network: Network,
+    flow: FlowState,
+    i: int,
+    topo_vect: I32,
+    gen_p: F32,
+    gen_v: F32 | F64,
+    load_p: F32,
+    load_q: F32,
+    storage_p: F32,
+) -> int:
+    """Write the equations of the flow of row ``i``; arguments as of :func:`run_flow`.
+
+    Returns:
+        :data:`PREPARED`; or :data:`DISCONNECTED` or :data:`DIVERGED`, if there is nothing to solve.
+    """
     if not (flow.known[i] and is_same_topology(flow.topo_vect[i], topo_vect)):
         remember_topology(flow.topo_vect[i], topo_vect)
-        flow.known[i] = True
         flow.warm[i] = False
         flow.connected[i] = build_nodes(network, flow, i, topo_vect)
+        flow.known[i] = True
         if flow.connected[i]:
             columns, values = measure_pattern(flow, i)
             flow.known[i] = columns <= flow.column.shape[1] and values <= flow.panel.shape[1]  # else it has no room
@@ -84,10 +110,16 @@ def run_flow(
     if not _slack_is_finite(flow, i) or _has_conflicting_setpoints(flow, i, gen_v):
         flow.warm[i] = False
         return DIVERGED
+    return PREPARED
+
+
+@borrowing_jit
+def solve_flow(network: Network, flow: FlowState, i: int, topo_vect: I32, gen_v: F32 | F64) -> int:
+    """Solve what :func:`prepare_flow` has written; :data:`CONVERGED` or :data:`DIVERGED`."""
     if flow.known[i]:
         converged = _solve(network, flow, i, gen_v, flow.column[i], flow.panel[i])
     else:
-        converged = _solve_beside(network, flow, i, gen_v, columns, values)
+        converged = _solve_beside(network, flow, i, topo_vect, gen_v)
     flow.warm[i] = converged and flow.known[i]
     return CONVERGED if converged else DIVERGED
 
@@ -123,15 +155,17 @@ def _solve(network: Network, flow: FlowState, i: int, gen_v: F32 | F64, column: 
         panel,
         flow.sparse_row,
     )
-    if flow.warm[i] and solve_warm(network, flow, i, gen_v, equations, factors):
+    if may_go_on(flow, i) and solve_warm(network, flow, i, gen_v, equations, factors):
         return True
     _write_start(flow, i, gen_v)
     return solve_cold(network, flow, i, equations, factors)
 
 
 @owning_jit
-def _solve_beside(network: Network, flow: FlowState, i: int, gen_v: F32 | F64, columns: Index, values: Index) -> bool:
+def _solve_beside(network: Network, flow: FlowState, i: int, topo_vect: I32, gen_v: F32 | F64) -> bool:
     """Solve a topology with more fill than the row has room for, in arrays of its own."""
+    build_nodes(network, flow, i, topo_vect)  # once more: others may have used the workspace since
+    columns, values = measure_pattern(flow, i)
     column, panel = np.empty(columns, np.uint16), np.empty(values, np.float64)
     write_pattern(flow, i, column)
     return _solve(network, flow, i, gen_v, column, panel)
@@ -206,17 +240,29 @@ def write_currents(network: Network, flow: FlowState, i: int, a_or: F32) -> None
         if origin == ABSENT:
             a_or[line] = 0.0
             continue
-        y = network.line_admittance[line]
-        e1, f1, e2, f2 = voltage[origin, 0], voltage[origin, 1], voltage[extremity, 0], voltage[extremity, 1]
-        real = y[0] * e1 - y[1] * f1 + y[2] * e2 - y[3] * f2
-        imaginary = y[0] * f1 + y[1] * e1 + y[2] * f2 + y[3] * e2
-        nominal = network.nominal_voltage[network.line_or_sub[line]]
-        if (e1 * e1 + f1 * f1) * (nominal * nominal) < _LOWEST_KILOVOLT * _LOWEST_KILOVOLT:
-            a_or[line] = 0.0
-            continue
-        base = network.base_power[0] / (math.sqrt(3.0) * nominal)
-        # In kA, rounded, then in A: as LightSimBackend does.
-        a_or[line] = np.float32(math.sqrt(real * real + imaginary * imaginary) * base) * np.float32(1000.0)
+        current = line_current(
+            network, line, voltage[origin, 0], voltage[origin, 1], voltage[extremity, 0], voltage[extremity, 1]
+        )
+        a_or[line] = amperes(current)
+
+
+@borrowing_jit
+def line_current(network: Network, line: int, e1, f1, e2, f2):  # type: ignore[no-untyped-def]
+    """Current at the origin of a line, kA, given the voltages of both ends, per unit: numbers, or lanes of them."""
+    y = network.line_admittance[line]
+    real = y[0] * e1 - y[1] * f1 + y[2] * e2 - y[3] * f2
+    imaginary = y[0] * f1 + y[1] * e1 + y[2] * f2 + y[3] * e2
+    nominal = network.nominal_voltage[network.line_or_sub[line]]
+    base = network.base_power[0] / (math.sqrt(3.0) * nominal)
+    current = root(real * real + imaginary * imaginary) * base
+    lowest = _LOWEST_KILOVOLT * _LOWEST_KILOVOLT
+    return where_less((e1 * e1 + f1 * f1) * (nominal * nominal), lowest, 0.0, current)
+
+
+@borrowing_jit
+def amperes(current: float) -> np.float32:
+    """A current in kA as LightSimBackend gives it: rounded, then in A."""
+    return np.float32(current) * np.float32(1000.0)
 
 
 @borrowing_jit

@@ -1,18 +1,22 @@
 """Newton's method in polar coordinates on the nodes of one environment.
 
-Magnitudes are solved for relative to themselves.
+Magnitudes are solved for relative to themselves. The equations are written once, for one environment and for lanes of
+several (:mod:`rl2grid.powerflow.warm_lanes`), which therefore find the same bits.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
 from rl2grid.arrays import F32, F64, U16
 from rl2grid.compile import borrowing_jit
-from rl2grid.powerflow.factors import ONE, THREE, factorise, solve
+from rl2grid.powerflow.factors import ONE, THREE, TWO, factorise, solve
 from rl2grid.powerflow.flow_state import ABSENT, Equations, Factors, FlowState
+from rl2grid.powerflow.lanes import entries, larger, like, where_equal, where_less
+from rl2grid.powerflow.lanes import magnitude as absolute
 from rl2grid.powerflow.model import Network
 
 _ROUND = 6755399441055744.0  # 1.5 * 2**52: adding and subtracting it rounds to the nearest whole number
@@ -23,9 +27,14 @@ _TRUSTED_STEPS = 5
 _WARM_STEPS = 8
 _SLOWEST = 0.5
 """A warm step that leaves more of the mismatch than this is no good step."""
+ARRIVED, STUCK, RENEW, STEP = range(4)
+"""What becomes of a warm flow: it is solved; it is left to the cold recipe; it needs new factors for its next step; or
+it takes another with those that it has."""
 _MAGNITUDE_RANGE = 0.03
 _ANGLE_RANGE = 0.1
 """How far from the anchor a warm solution may be, per unit and radians."""
+_node_at, _set_node = entries(1)
+_part_at, _set_part = entries(2)
 
 
 @borrowing_jit
@@ -36,33 +45,32 @@ def write_voltage(equations: Equations) -> None:
     """
     magnitude, angle, voltage = equations.magnitude, equations.angle, equations.voltage
     for node in range(equations.n_free + 1):
-        quarter = (angle[node] * (2.0 / math.pi) + _ROUND) - _ROUND
-        x = (angle[node] - quarter * _HALF_PI_HIGH) - quarter * _HALF_PI_LOW
+        turned = _node_at(angle, node)
+        quarter = (turned * (2.0 / math.pi) + _ROUND) - _ROUND
+        x = (turned - quarter * _HALF_PI_HIGH) - quarter * _HALF_PI_LOW
         turn = quarter - 4.0 * ((quarter * 0.25 + _ROUND) - _ROUND)  # -2, -1, 0, 1 or 2
         z = x * x
-        sine = 1.58969099521155010221e-10
-        sine = -2.50507602534068634195e-08 + z * sine
+        sine = z * 1.58969099521155010221e-10 + -2.50507602534068634195e-08
         sine = 2.75573137070700676789e-06 + z * sine
         sine = -1.98412698298579493134e-04 + z * sine
         sine = 8.33333333332248946124e-03 + z * sine
         sine = -1.66666666666666324348e-01 + z * sine
         sine = x + x * (z * sine)
-        cosine = -1.13596475577881948265e-11
-        cosine = 2.08757232129817482790e-09 + z * cosine
+        cosine = z * -1.13596475577881948265e-11 + 2.08757232129817482790e-09
         cosine = -2.75573143513906633035e-07 + z * cosine
         cosine = 2.48015872894767294178e-05 + z * cosine
         cosine = -1.38888888888741095749e-03 + z * cosine
         cosine = 4.16666666666666019037e-02 + z * cosine
         cosine = (1.0 - 0.5 * z) + z * z * cosine
-        odd = abs(turn) == 1.0
-        along = -sine * turn if odd else (cosine if turn == 0.0 else -cosine)
-        across = cosine * turn if odd else (sine if turn == 0.0 else -sine)
-        voltage[node, 0] = magnitude[node] * along
-        voltage[node, 1] = magnitude[node] * across
+        across_the_axis = absolute(turn)
+        along = where_equal(across_the_axis, 1.0, -sine * turn, where_equal(turn, 0.0, cosine, -cosine))
+        across = where_equal(across_the_axis, 1.0, cosine * turn, where_equal(turn, 0.0, sine, -sine))
+        _set_part(voltage, 2 * node, _node_at(magnitude, node) * along)
+        _set_part(voltage, 2 * node + 1, _node_at(magnitude, node) * across)
 
 
 @borrowing_jit
-def measure_mismatch(equations: Equations) -> float:
+def measure_mismatch(equations: Equations) -> Any:
     """Write the power that the voltages give, and as ``step`` its mismatch.
 
     Returns:
@@ -71,26 +79,27 @@ def measure_mismatch(equations: Equations) -> float:
     first, column, value = equations.admittance_first, equations.admittance_node, equations.admittance
     voltage, injection, power = equations.voltage, equations.injection, equations.power
     first_unknown, step = equations.first_unknown, equations.step
-    worst = 0.0
-    spoiled = 0.0
+    worst = spoiled = like(_part_at(voltage, 0), 0.0)
     for node in range(equations.n_free):
-        real = 0.0
-        imaginary = 0.0
+        real = imaginary = like(worst, 0.0)
         for entry in range(first[node], first[node + 1]):
-            other = column[entry]
-            real += value[entry, 0] * voltage[other, 0] - value[entry, 1] * voltage[other, 1]
-            imaginary += value[entry, 0] * voltage[other, 1] + value[entry, 1] * voltage[other, 0]
-        power[node, 0] = voltage[node, 0] * real + voltage[node, 1] * imaginary
-        power[node, 1] = voltage[node, 1] * real - voltage[node, 0] * imaginary
-        unknown = first_unknown[node]
-        difference = power[node, 0] - injection[node, 0]
-        step[unknown] = difference
-        worst = max(worst, abs(difference))
+            other = TWO * column[entry]
+            e, f = _part_at(voltage, other), _part_at(voltage, other + ONE)
+            real += value[entry, 0] * e - value[entry, 1] * f
+            imaginary += value[entry, 0] * f + value[entry, 1] * e
+        e, f = _part_at(voltage, 2 * node), _part_at(voltage, 2 * node + 1)
+        active, reactive = e * real + f * imaginary, f * real - e * imaginary
+        _set_part(power, 2 * node, active)
+        _set_part(power, 2 * node + 1, reactive)
+        unknown = np.uint64(first_unknown[node])
+        difference = active - _part_at(injection, 2 * node)
+        _set_node(step, unknown, difference)
+        worst = larger(worst, absolute(difference))
         spoiled += 0.0 * difference
-        if first_unknown[node + 1] - unknown == 2:
-            difference = power[node, 1] - injection[node, 1]
-            step[unknown + ONE] = difference
-            worst = max(worst, abs(difference))
+        if first_unknown[node + 1] - first_unknown[node] == 2:
+            difference = reactive - _part_at(injection, 2 * node + 1)
+            _set_node(step, unknown + ONE, difference)
+            worst = larger(worst, absolute(difference))
             spoiled += 0.0 * difference
     return worst + spoiled
 
@@ -102,33 +111,35 @@ def fill_jacobian(equations: Equations, factors: Factors) -> None:
     voltage, power, n_free = equations.voltage, equations.power, equations.n_free
     first_unknown, block, panel = equations.first_unknown, equations.admittance_panel, factors.panel
     for k in range(factors.first_panel[n_free]):
-        panel[k] = 0.0
+        _set_node(panel, k, 0.0)
     for node in range(n_free):
-        e, f = voltage[node, 0], voltage[node, 1]
+        e, f = _part_at(voltage, 2 * node), _part_at(voltage, 2 * node + 1)
         rows = first_unknown[node + 1] - first_unknown[node]
         for entry in range(first[node], first[node + 1]):
             other = column[entry]
             if other >= n_free:
                 continue
-            real = value[entry, 0] * voltage[other, 0] - value[entry, 1] * voltage[other, 1]
-            imaginary = value[entry, 0] * voltage[other, 1] + value[entry, 1] * voltage[other, 0]
+            e2, f2 = _part_at(voltage, TWO * other), _part_at(voltage, TWO * other + ONE)
+            real = value[entry, 0] * e2 - value[entry, 1] * f2
+            imaginary = value[entry, 0] * f2 + value[entry, 1] * e2
             along = e * real + f * imaginary
             across = f * real - e * imaginary
             p_angle, p_magnitude, q_angle, q_magnitude = across, along, -along, across
             if other == node:
-                p_angle -= power[node, 1]
-                p_magnitude += power[node, 0]
-                q_angle += power[node, 0]
-                q_magnitude += power[node, 1]
+                active, reactive = _part_at(power, 2 * node), _part_at(power, 2 * node + 1)
+                p_angle -= reactive
+                p_magnitude += active
+                q_angle += active
+                q_magnitude += reactive
             at = np.uint64(block[entry])
             columns = first_unknown[other + ONE] - first_unknown[other]
-            panel[at] = p_angle
+            _set_node(panel, at, p_angle)
             if rows == 2:
-                panel[at + ONE] = q_angle
+                _set_node(panel, at + ONE, q_angle)
             if columns == 2:
-                panel[at + np.uint64(rows)] = p_magnitude
+                _set_node(panel, at + np.uint64(rows), p_magnitude)
                 if rows == 2:
-                    panel[at + THREE] = q_magnitude
+                    _set_node(panel, at + THREE, q_magnitude)
 
 
 @borrowing_jit
@@ -169,17 +180,14 @@ def apply_step(equations: Equations) -> None:
     first_unknown, step = equations.first_unknown, equations.step
     magnitude, angle = equations.magnitude, equations.angle
     for node in range(equations.n_free):
-        u = first_unknown[node]
-        turned = angle[node] - step[u]
-        if first_unknown[node + 1] - u == 2:
-            size = magnitude[node] * (1.0 - step[u + ONE])
-            if size < 0.0:
-                size = -size
-                turned += math.pi
-            magnitude[node] = size
-        if abs(turned) > math.pi:
-            turned -= 2.0 * math.pi * ((turned * (0.5 / math.pi) + _ROUND) - _ROUND)
-        angle[node] = turned
+        unknown = np.uint64(first_unknown[node])
+        turned = _node_at(angle, node) - _node_at(step, unknown)
+        if first_unknown[node + 1] - first_unknown[node] == 2:
+            size = _node_at(magnitude, node) * (1.0 - _node_at(step, unknown + ONE))
+            turned = where_less(size, 0.0, turned + math.pi, turned)
+            _set_node(magnitude, node, where_less(size, 0.0, -size, size))
+        whole = (turned * (0.5 / math.pi) + _ROUND) - _ROUND
+        _set_node(angle, node, where_less(math.pi, absolute(turned), turned - 2.0 * math.pi * whole, turned))
     write_voltage(equations)
 
 
@@ -199,7 +207,7 @@ def solve_cold(network: Network, flow: FlowState, i: int, equations: Equations, 
         the voltages and remembers them as its anchor.
     """
     fill_dc(network, flow, i, equations, factors)
-    if not factorise(factors):
+    if factorise(factors) == 0.0:
         return False
     step, angle = equations.step, equations.angle
     solve(factors, step)
@@ -219,7 +227,7 @@ def solve_cold(network: Network, flow: FlowState, i: int, equations: Equations, 
         # So close to the solution the last factors do as well as new ones, and a full step would surely converge.
         if iteration > _TRUSTED_STEPS or not mismatch * (4.0 * ratio) ** 2 < tolerance:
             fill_jacobian(equations, factors)
-            if not factorise(factors):
+            if factorise(factors) == 0.0:
                 return False
         solve(factors, equations.step)
         apply_step(equations)
@@ -252,29 +260,49 @@ def solve_warm(
         Whether a solution was found for which the cold recipe can be trusted to find the same: few good steps lead
         to it, and it is close to a solution (the anchor) that the cold recipe did find without trouble.
     """
-    if flow.anchor_steps[i] > _TRUSTED_STEPS:
-        return False
     if _change_setpoints(equations, flow.gen_node[i], gen_v):
         write_voltage(equations)
-    tolerance = network.tolerance[0]
-    mismatch = measure_mismatch(equations)
-    ratio = 0.0
-    for step in range(_WARM_STEPS):
-        if mismatch < tolerance:
+    mismatch, ratio = measure_mismatch(equations), 0.0
+    for n_steps in range(_WARM_STEPS + 1):
+        verdict = judge_warm(n_steps, mismatch, ratio, network.tolerance[0])
+        if verdict == ARRIVED:
             return _is_near_anchor(equations, flow.anchor[i])
-        if not ratio < _SLOWEST:
+        if verdict == STUCK:
             return False
-        # Factors of the last call do for the first step; then new ones, unless three steps more will do.
-        if step > 0 and not mismatch * ratio**3 < tolerance:
+        if verdict == RENEW:
             fill_jacobian(equations, factors)
-            if not factorise(factors):
+            if factorise(factors) == 0.0:
                 return False
         solve(factors, equations.step)
         apply_step(equations)
         before = mismatch
         mismatch = measure_mismatch(equations)
         ratio = mismatch / before
-    return bool(mismatch < tolerance) and _is_near_anchor(equations, flow.anchor[i])
+    return False
+
+
+@borrowing_jit
+def may_go_on(flow: FlowState, i: int) -> bool:
+    """Whether row ``i`` has a solved flow of its topology to go on from, near which the cold recipe had no trouble."""
+    return bool(flow.warm[i]) and flow.anchor_steps[i] <= _TRUSTED_STEPS
+
+
+@borrowing_jit
+def judge_warm(n_steps: int, mismatch: float, ratio: float, tolerance: float) -> int:
+    """How a flow goes on that went on from the last one: ARRIVED, STUCK, RENEW or STEP.
+
+    Args:
+        n_steps: that it has taken.
+        mismatch: that they have left, per unit.
+        ratio: of that to the one before the last step, 0 before the first.
+        tolerance: per unit.
+    """
+    if mismatch < tolerance:
+        return ARRIVED
+    if n_steps == _WARM_STEPS or not ratio < _SLOWEST:
+        return STUCK
+    # Factors of the last flow do for the first step; then new ones, unless three steps more will do.
+    return RENEW if n_steps > 0 and not mismatch * ratio**3 < tolerance else STEP
 
 
 @borrowing_jit
@@ -293,6 +321,11 @@ def _is_near_anchor(equations: Equations, anchor: F64) -> bool:
     magnitude, angle = equations.magnitude, equations.angle
     far = False
     for node in range(equations.n_free + 1):
-        far |= abs(magnitude[node] - anchor[node, 0]) > _MAGNITUDE_RANGE
-        far |= abs(angle[node] - anchor[node, 1]) > _ANGLE_RANGE
+        far |= is_far(magnitude[node], angle[node], anchor[node, 0], anchor[node, 1])
     return not far
+
+
+@borrowing_jit
+def is_far(magnitude: float, angle: float, anchor_magnitude: float, anchor_angle: float) -> bool:
+    """Whether a node's voltage is too far from where the cold recipe found it to be trusted; per unit and radians."""
+    return abs(magnitude - anchor_magnitude) > _MAGNITUDE_RANGE or abs(angle - anchor_angle) > _ANGLE_RANGE
