@@ -13,8 +13,9 @@ from rl2grid.compile import jit
 from rl2grid.engines.native.action_notes import note_action
 from rl2grid.engines.native.environments import Environments, open_environments
 from rl2grid.engines.native.orders import Orders, order_one_change
+from rl2grid.engines.native.side_by_side import step_side_by_side
 from rl2grid.engines.native.simulation import begin_simulation, copy_environment, finish_simulation
-from rl2grid.engines.native.step import begin_step, dispatch_or_lose, finish_step
+from rl2grid.engines.native.step import dispatch_or_lose
 from rl2grid.mdp.accumulate import accrue, begin_episode, begin_transition, end_reset
 from rl2grid.mdp.actions import ActionKind
 from rl2grid.mdp.heuristics import (
@@ -46,6 +47,10 @@ DEFAULT, PAPER, RELEASED = range(3)
 """Rewards that are compiled in."""
 
 _NOTHING, _MOVE, _RESTORE = int(ActionKind.NOTHING), int(ActionKind.MOVE), int(ActionKind.RESTORE)
+
+_ABREAST = 16
+"""Rows that a thread plays at the same time: twice as many as flows are solved side by side, because the topologies of
+rows differ."""
 
 Components = tuple[float, float, float]
 
@@ -94,39 +99,76 @@ def advance(
     """
     environments = open_environments(address)
     state, orders = environments.state, environments.orders
+    under_way, status = np.empty(_ABREAST, np.int64), np.empty(_ABREAST, np.int64)
+    is_agents_step = np.empty(_ABREAST, np.bool_)
+    illegal, ambiguous = np.empty(_ABREAST, np.bool_), np.empty(_ABREAST, np.bool_)
+    n = k = 0
     while True:
-        # Heuristics play some rows a hundred times as long as others: who is free takes the next.
-        k: int = take_next(np.int64(counter.ctypes.data))  # type: ignore[call-arg]
-        if k >= rows.shape[0]:
-            break
-        i = rows[k]
-        illegal, ambiguous = False, False
-        if begins:
-            begin_episode(state, i)
-            remember_nothing(state, i)
-            if heuristic >= CAREFUL:
-                remember_topology(state, i)
-        else:
-            begin_transition(state, i)
-            state.decisions[i] += 1
-            _order(orders, i, k, first, end, kinds, targets, masks, injects, values)
-            _step(environments, i, reward, weights, gamma)
-            note_action(environments.notes, environments.constants, orders, state, i)
-            illegal, ambiguous = state.illegal[i], state.ambiguous[i]
-            if heuristic >= CAREFUL:
-                remember_topology(state, i)
-                _remember_moves(state, orders, i)
-        while heuristic != ALONE and not (state.terminated[i] or state.truncated[i]) and is_safe(state, i):
-            kind, target = _heuristic_action(environments, simulated, security, i, heuristic)
-            if kind == _NOTHING and _asks(state, i, heuristic, security):
+        # Heuristics play some rows a hundred times as long as others: who is done takes the next.
+        while n < _ABREAST and k < rows.shape[0]:
+            k = take_next(np.int64(counter.ctypes.data))  # type: ignore[call-arg]
+            if k >= rows.shape[0]:
                 break
-            order_one_change(orders, i, kind, target)
-            _step(environments, i, reward, weights, gamma)
+            i = rows[k]
+            under_way[n], is_agents_step[n], illegal[n], ambiguous[n] = i, not begins, False, False
+            if begins:
+                _begin_episode(state, i, heuristic)
+                if not _goes_on(environments, simulated, security, i, heuristic):
+                    _hand_over(state, i, begins, False, False)
+                    continue
+            else:
+                begin_transition(state, i)
+                state.decisions[i] += 1
+                _order(orders, i, k, first, end, kinds, targets, masks, injects, values)
+            n += 1
+        if n == 0:
+            break
+        step_side_by_side(environments, under_way, n, status)
+        n_before, n = n, 0
+        for slot in range(n_before):
+            i = under_way[slot]
+            _accrue(state, i, reward, weights, gamma)
+            if is_agents_step[slot]:
+                note_action(environments.notes, environments.constants, orders, state, i)
+                illegal[slot], ambiguous[slot] = state.illegal[i], state.ambiguous[i]
             if heuristic >= CAREFUL:
                 remember_topology(state, i)
-        state.illegal[i], state.ambiguous[i] = illegal, ambiguous
-        if begins:
-            end_reset(state, i)
+                if is_agents_step[slot]:
+                    _remember_moves(state, orders, i)
+            if not _goes_on(environments, simulated, security, i, heuristic):
+                _hand_over(state, i, begins, illegal[slot], ambiguous[slot])
+                continue
+            under_way[n], is_agents_step[n], illegal[n], ambiguous[n] = i, False, illegal[slot], ambiguous[slot]
+            n += 1
+
+
+@jit
+def _begin_episode(state: GridState, i: int, heuristic: int) -> None:
+    begin_episode(state, i)
+    remember_nothing(state, i)
+    if heuristic >= CAREFUL:
+        remember_topology(state, i)
+
+
+@jit
+def _goes_on(environments: Environments, simulated: int, security: int, i: int, heuristic: int) -> bool:
+    """Order the heuristic's next step in row ``i``; False if it is over, or the agent's turn."""
+    state = environments.state
+    if heuristic == ALONE or state.terminated[i] or state.truncated[i] or not is_safe(state, i):
+        return False
+    kind, target = _heuristic_action(environments, simulated, security, i, heuristic)
+    if kind == _NOTHING and _asks(state, i, heuristic, security):
+        return False
+    order_one_change(environments.orders, i, kind, target)
+    return True
+
+
+@jit
+def _hand_over(state: GridState, i: int, begins: bool, illegal: bool, ambiguous: bool) -> None:
+    """End the transition of row ``i``; what is said of legality is the agent's action's."""
+    state.illegal[i], state.ambiguous[i] = illegal, ambiguous
+    if begins:
+        end_reset(state, i)
 
 
 @jit
@@ -219,12 +261,8 @@ def _remember_moves(state: GridState, orders: Orders, i: int) -> None:
 
 
 @jit
-def _step(environments: Environments, i: int, reward: int, weights: Components, gamma: float) -> None:
-    """One grid step and what it is worth."""
-    state = environments.state
-    needed = begin_step(environments, i, True)
-    if not needed or dispatch_or_lose(environments, i):
-        finish_step(environments, i)
+def _accrue(state: GridState, i: int, reward: int, weights: Components, gamma: float) -> None:
+    """What the grid step that row ``i`` has made is worth."""
     survive, overload, cost = _components(state, i, reward)
     accrue(state, i, survive, overload, cost, weights, gamma)
 
@@ -255,11 +293,12 @@ def write_observations(
     """
     state = open_environments(address).state
     for i in rows:
+        observation = out[i]
         if topology and dispatch:
-            write_joint_observation(state, i, out[i])
+            write_joint_observation(state, i, observation)
         elif topology:
-            write_topology_observation(state, i, out[i])
+            write_topology_observation(state, i, observation)
         else:
-            write_redispatch_observation(state, i, out[i])
+            write_redispatch_observation(state, i, observation)
         for entry in range(shift.shape[0]):
-            out[i, entry] = (out[i, entry] - shift[entry]) / scale[entry]
+            observation[entry] = (observation[entry] - shift[entry]) / scale[entry]

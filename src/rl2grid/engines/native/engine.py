@@ -309,7 +309,8 @@ class NativeEngine:
         """The same environments with a workspace for thread ``thread``: threads may then play different rows."""
         while len(self._handles) <= thread:
             flow = with_own_workspace(self.environments.flow)
-            self._handles.append(Handle(self.environments._replace(flow=flow)))
+            lanes = with_own_workspace(self.environments.lanes)
+            self._handles.append(Handle(self.environments._replace(flow=flow, lanes=lanes)))
         return self._handles[thread].address
 
     def trial_address_for(self, thread: int) -> int:

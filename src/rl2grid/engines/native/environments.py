@@ -15,6 +15,7 @@ from rl2grid.mdp.opponents import OpponentState, new_opponent_state
 from rl2grid.mdp.state import GridState, new_state
 from rl2grid.powerflow.ac import FlowState, new_flow_state
 from rl2grid.powerflow.model import Network
+from rl2grid.powerflow.warm_lanes import WarmLanes, new_warm_lanes
 
 
 class Environments(NamedTuple):
@@ -29,6 +30,7 @@ class Environments(NamedTuple):
     state: GridState
     hidden: HiddenState
     flow: FlowState
+    lanes: WarmLanes
     opponent: OpponentState
     orders: Orders
     notes: ActionNotes
@@ -36,13 +38,15 @@ class Environments(NamedTuple):
 
 def new_environments(grid: Grid, network: Network, n: int, opponent: bool, outages: int = 0) -> Environments:
     """Blank arrays for ``n`` environments of ``grid``, with room for ``outages`` planned outages each."""
+    flow = new_flow_state(network, n)
     attacked = grid if opponent else replace(grid, opponent=OpponentConfig("none"))
     return Environments(
         new_constants(grid),
         network,
         new_state(grid, n),
         new_hidden_state(grid, n, outages),
-        new_flow_state(network, n),
+        flow,
+        new_warm_lanes(flow),
         new_opponent_state(attacked, n),
         new_orders(grid, n),
         new_action_notes(grid, n),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from rl2grid.compile import jit
 from rl2grid.engines.native.environments import Environments
 from rl2grid.engines.native.topology import open_line
-from rl2grid.powerflow.ac import CONVERGED, run_flow, write_currents
+from rl2grid.powerflow.ac import CONVERGED, PREPARED, prepare_flow, solve_flow, write_currents
 
 
 @jit
@@ -20,32 +20,63 @@ def flow_with_cascade(environments: Environments, i: int, soft: bool) -> bool:
         i: the row.
         soft: whether overloads are counted; not so in the first row of an episode.
     """
-    network, state, hidden, flow = environments.network, environments.state, environments.hidden, environments.flow
+    begin_cascade(environments, i)
+    status = prepare(environments, i)
+    if status == PREPARED:
+        status = find_flow(environments, i)
+    return status == CONVERGED and follow_cascade(environments, i, soft)
+
+
+@jit
+def begin_cascade(environments: Environments, i: int) -> None:
+    """Nothing has tripped yet."""
+    hidden = environments.hidden
     hidden.tripped[i] = False
     hidden.counted[i] = False
     hidden.running_count[i] = hidden.protection[i]
-    while True:
-        status = run_flow(
-            network,
-            flow,
-            i,
-            state.topo_vect[i],
-            hidden.gen_p[i],
-            hidden.gen_v[i],
-            hidden.load_p[i],
-            hidden.load_q[i],
-            state.storage_power[i],
-        )
-        if status != CONVERGED:
-            return False
+
+
+@jit
+def prepare(environments: Environments, i: int) -> int:
+    """:func:`rl2grid.powerflow.ac.prepare_flow` with the topology and the injections of row ``i``."""
+    network, state, hidden, flow = environments.network, environments.state, environments.hidden, environments.flow
+    return prepare_flow(
+        network,
+        flow,
+        i,
+        state.topo_vect[i],
+        hidden.gen_p[i],
+        hidden.gen_v[i],
+        hidden.load_p[i],
+        hidden.load_q[i],
+        state.storage_power[i],
+    )
+
+
+@jit
+def find_flow(environments: Environments, i: int) -> int:
+    """Solve a flow that is PREPARED, and write the currents if it is CONVERGED; its status."""
+    network, state, flow = environments.network, environments.state, environments.flow
+    status = solve_flow(network, flow, i, state.topo_vect[i], environments.hidden.gen_v[i])
+    if status == CONVERGED:
         write_currents(network, flow, i, state.a_or[i])
-        if not _trip_lines(environments, i, soft):
-            return True
+    return status
+
+
+@jit
+def follow_cascade(environments: Environments, i: int, soft: bool) -> bool:
+    """Trip lines after a flow, and repeat until nothing trips; as :func:`flow_with_cascade`."""
+    while _trip_lines(environments, i, soft):
+        if prepare(environments, i) != PREPARED or find_flow(environments, i) != CONVERGED:
+            return False
+    return True
 
 
 @jit
 def _trip_lines(environments: Environments, i: int, soft: bool) -> bool:
     """Open what the protections open; whether anything was opened."""
+    if not _any_line_is_in_doubt(environments, i):
+        return False
     constants, state, hidden = environments.constants, environments.state, environments.hidden
     any_tripped = False
     for line in range(state.a_or.shape[1]):
@@ -60,3 +91,15 @@ def _trip_lines(environments: Environments, i: int, soft: bool) -> bool:
             open_line(state, i, line)
             any_tripped = True
     return any_tripped
+
+
+@jit
+def _any_line_is_in_doubt(environments: Environments, i: int) -> bool:
+    """Whether a line is overloaded, above its hard limit, or was overloaded too often; in most steps none is."""
+    constants, state = environments.constants, environments.state
+    current, count, allowed = state.a_or[i], environments.hidden.running_count[i], constants.overflow_allowed[0]
+    in_doubt = False
+    for line in range(current.shape[0]):
+        in_doubt |= (current[line] > state.thermal_limit[line]) | (current[line] > constants.hard_limit[line])
+        in_doubt |= count[line] > allowed
+    return in_doubt

@@ -7,8 +7,9 @@ import numpy as np
 from rl2grid.compile import jit
 from rl2grid.engines.native.environments import Environments
 from rl2grid.engines.native.generation import set_generators
+from rl2grid.engines.native.protections import flow_with_cascade
 from rl2grid.engines.native.series import read_forecast
-from rl2grid.engines.native.step import play_order, prepare_dispatch, run_and_register
+from rl2grid.engines.native.step import play_order, prepare_dispatch, register
 from rl2grid.engines.native.topology import judge_order, open_line
 from rl2grid.mdp.state import GridState
 from rl2grid.structures import copy_row
@@ -48,7 +49,7 @@ def begin_simulation(
 def finish_simulation(environments: Environments) -> None:
     """Play the simulated step of row 0 from after the redispatch to the observation."""
     set_generators(environments, 0)
-    run_and_register(environments, 0)
+    register(environments, 0, flow_with_cascade(environments, 0, True))
 
 
 @jit

@@ -132,6 +132,13 @@ def lose_by_dispatch(state: GridState, i: int) -> None:
 @jit
 def finish_step(environments: Environments, i: int) -> None:
     """Play the step of environment ``i`` from after the redispatch to the observation."""
+    set_scene(environments, i)
+    end_step(environments, i, flow_with_cascade(environments, i, True))
+
+
+@jit
+def set_scene(environments: Environments, i: int) -> None:
+    """Maintenance, generators and the opponent's turn: all that the power flow of row ``i`` depends on."""
     state, opponent = environments.state, environments.opponent
     _open_for_maintenance(state, i)
     set_generators(environments, i)
@@ -142,16 +149,22 @@ def finish_step(environments: Environments, i: int) -> None:
             open_line(state, i, line)
             written = opponent.cooldown_written[i, line]
             state.time_before_cooldown_line[i, line] = max(state.time_before_cooldown_line[i, line], written)
-    run_and_register(environments, i)
+
+
+@jit
+def end_step(environments: Environments, i: int, is_found: bool) -> None:
+    """Register the power flow of a step; whether the episode is completed."""
+    state = environments.state
+    register(environments, i, is_found)
     if not state.terminated[i]:
         state.truncated[i] = state.step[i] >= state.episode_length[i]
 
 
 @jit
-def run_and_register(environments: Environments, i: int) -> None:
-    """Power flow and cascade, then the counters and the observation; or the game over."""
+def register(environments: Environments, i: int, is_found: bool) -> None:
+    """The counters and the observation after power flow and cascade; the game over if no flow was found."""
     state, hidden = environments.state, environments.hidden
-    if not flow_with_cascade(environments, i, True):
+    if not is_found:
         lose(state, i, game_over_by_flow(state, i))
         return
     remember_busbars(environments, i)
@@ -196,28 +209,31 @@ def _open_for_maintenance(state: GridState, i: int) -> None:
 def _count_down_lines(environments: Environments, i: int) -> None:
     """Cooldowns of lines: one step less, then what protections, maintenance and the agent impose."""
     constants, state, hidden = environments.constants, environments.state, environments.hidden
-    cooldown = state.time_before_cooldown_line[i]
+    cooldown, tripped, touched = state.time_before_cooldown_line[i], hidden.tripped[i], hidden.touched_line[i]
+    maintenance = state.time_next_maintenance[i]
+    any_imposed = False
     for line in range(cooldown.shape[0]):
-        if cooldown[line] > 0:
-            cooldown[line] -= 1
-        if hidden.tripped[i, line]:
+        cooldown[line] -= cooldown[line] > 0
+        any_imposed |= tripped[line] | touched[line] | (maintenance[line] == 0)
+    if not any_imposed:
+        return
+    for line in range(cooldown.shape[0]):
+        if tripped[line]:
             cooldown[line] = constants.reconnection[0]
-        if state.time_next_maintenance[i, line] == 0:
+        if maintenance[line] == 0:
             cooldown[line] = max(cooldown[line], state.duration_next_maintenance[i, line])
-        if hidden.touched_line[i, line] and constants.cooldown_line[0] > 0:
+        if touched[line] and constants.cooldown_line[0] > 0:
             cooldown[line] = max(cooldown[line], constants.cooldown_line[0])
 
 
 @jit
 def _count_overloads(environments: Environments, i: int) -> None:
     state, hidden = environments.state, environments.hidden
+    overflow, protection = state.timestep_overflow[i], hidden.protection[i]
     for line in range(state.a_or.shape[1]):
-        if state.a_or[i, line] > state.thermal_limit[line]:
-            state.timestep_overflow[i, line] += 1
-            hidden.protection[i, line] += 1
-        else:
-            state.timestep_overflow[i, line] = 0
-            hidden.protection[i, line] = 0
+        is_over = state.a_or[i, line] > state.thermal_limit[line]
+        overflow[line] = overflow[line] + 1 if is_over else 0
+        protection[line] = protection[line] + 1 if is_over else 0
 
 
 @jit

@@ -1,0 +1,258 @@
+"""Flows of several rows of one topology that go on from their last ones, side by side.
+
+Each lane takes the steps that :func:`rl2grid.powerflow.newton.solve_warm` takes for a row alone, by the same functions
+and verdicts, so that the bits of a flow depend neither on the rows beside it nor on whether there are any. What a lane
+cannot accept stays as it was, for :func:`rl2grid.powerflow.ac.solve_flow` to decide.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, NamedTuple
+
+import numpy as np
+
+from rl2grid.arrays import F32, F64, I8, I64, Flags, Index
+from rl2grid.compile import borrowing_jit
+from rl2grid.powerflow.ac import amperes, line_current
+from rl2grid.powerflow.factors import ONE, TWO, factorise, solve
+from rl2grid.powerflow.flow_state import ABSENT, Equations, Factors, FlowState
+from rl2grid.powerflow.lane_flow import DONE, FAILED, RUNNING
+from rl2grid.powerflow.lanes import WIDTH, Lanes, load, load_columns, splat, store, store_columns, where_less
+from rl2grid.powerflow.model import Network
+from rl2grid.powerflow.newton import (
+    ARRIVED,
+    RENEW,
+    STUCK,
+    apply_step,
+    fill_jacobian,
+    is_far,
+    judge_warm,
+    measure_mismatch,
+    write_voltage,
+)
+from rl2grid.structures import allocate, workspace
+
+
+class WarmLanes(NamedTuple):
+    """Power flows side by side; what is not explained is as in :class:`~rl2grid.powerflow.flow_state.FlowState`."""
+
+    magnitude: Annotated[Lanes, workspace("bus lane")]
+    angle: Annotated[Lanes, workspace("bus lane")]
+    voltage: Annotated[Lanes, workspace("bus 2 lane")]
+    injection: Annotated[Lanes, workspace("bus 2 lane")]
+    power: Annotated[Lanes, workspace("bus 2 lane")]
+    step: Annotated[Lanes, workspace("unknown lane")]
+    panel: Annotated[Lanes, workspace("value lane")]
+    new_panel: Annotated[Lanes, workspace("value lane", "factors at the present voltages, of lanes that want them")]
+    sparse_row: Annotated[Lanes, workspace("unknown 2 lane")]
+    mismatch: Annotated[Lanes, workspace("1 lane", "largest, not a number if any is not finite", "per unit")]
+    mismatch_before: Annotated[Lanes, workspace("1 lane", "a step ago", "per unit")]
+    active: Annotated[Lanes, workspace("1 lane", "1.0 in lanes that take a step")]
+    renews: Annotated[Lanes, workspace("1 lane", "1.0 in lanes that want new factors for it")]
+    sound: Annotated[Lanes, workspace("1 lane", "0.0 in lanes whose new factors are of a singular matrix")]
+    current: Annotated[Lanes, workspace("line lane", "at the origin", "kA")]
+    row: Annotated[I64, workspace("lane", "that it works for")]
+    place: Annotated[I64, workspace("lane", "of the row among those of the caller")]
+    state: Annotated[I8, workspace("lane", "RUNNING, DONE or FAILED")]
+    renewed: Annotated[Flags, workspace("lane", "the factors are not those of the last flow")]
+
+
+def new_warm_lanes(flow: FlowState) -> WarmLanes:
+    """Blank lanes for rows of ``flow``."""
+    sizes = {
+        "bus": flow.magnitude.shape[1],
+        "unknown": len(flow.step),
+        "value": flow.panel.shape[1],
+        "line": flow.line_or_node.shape[1],
+        "lane": WIDTH,
+    }
+    return allocate(WarmLanes, sizes)
+
+
+@borrowing_jit
+def solve_side_by_side(
+    network: Network, flow: FlowState, lanes: WarmLanes, n: int, gen_v: F32 | F64, a_or: F32
+) -> None:
+    """Solve the flows of the first ``n`` lanes' rows, which were prepared, have one topology and may go on.
+
+    Lanes end as DONE, voltages and factors of their rows written, or as FAILED, their rows untouched.
+
+    Args:
+        network: electrical model of the grid.
+        flow: rows of environments.
+        lanes: ``row`` says which of them.
+        n: how many lanes are used, at most ``WIDTH``.
+        gen_v: [row, gen] voltage set-points, per unit.
+        a_or: float32 [row, line], written where the lane is DONE: as :func:`rl2grid.powerflow.ac.write_currents`.
+    """
+    i = lanes.row[0]
+    n_free = np.int64(flow.n_node[i]) - 1
+    equations = Equations(
+        n_free, flow.first_unknown[i], flow.admittance_first[i], flow.admittance_node[i], flow.admittance[i],
+        flow.admittance_panel[i], lanes.magnitude, lanes.angle, lanes.voltage, lanes.injection, lanes.power, lanes.step,
+    )  # fmt: skip
+    factors = Factors(
+        n_free, flow.first_unknown[i], flow.node_of_unknown[i], flow.first_column[i], flow.own_column[i],
+        flow.first_panel[i], flow.own_panel[i], flow.column[i], lanes.panel, lanes.sparse_row,
+    )  # fmt: skip
+    new_factors = Factors(
+        n_free, flow.first_unknown[i], flow.node_of_unknown[i], flow.first_column[i], flow.own_column[i],
+        flow.first_panel[i], flow.own_panel[i], flow.column[i], lanes.new_panel, lanes.sparse_row,
+    )  # fmt: skip
+    n_values = np.int64(flow.first_panel[i, n_free])
+    for lane in range(WIDTH):
+        lanes.state[lane] = FAILED
+        if lane < n:
+            _begin(flow, lanes, lane, gen_v[lanes.row[lane]])
+    _gather_factors(flow, lanes, n, n_values)
+    write_voltage(equations)
+    store(lanes.mismatch, 0, measure_mismatch(equations))
+    n_steps = 0
+    while _judge(lanes, n, n_steps, network.tolerance[0]):
+        if _any(lanes.renews, n):
+            fill_jacobian(equations, new_factors)
+            store(lanes.sound, 0, factorise(new_factors))
+            _take_new_factors(lanes, n, n_values)
+        solve(factors, lanes.step)
+        _hold_still(lanes, equations)
+        apply_step(equations)
+        store(lanes.mismatch_before, 0, load(lanes.mismatch, 0))
+        store(lanes.mismatch, 0, measure_mismatch(equations))
+        n_steps += 1
+    _write_currents(network, flow, i, lanes)
+    for lane in range(n):
+        if lanes.state[lane] == DONE:
+            _finish(flow, lanes, lane, a_or[lanes.row[lane]])
+    _scatter_factors(flow, lanes, n, n_values)
+
+
+@borrowing_jit
+def _begin(flow: FlowState, lanes: WarmLanes, lane: Index, gen_v: F32 | F64) -> None:
+    """Copy a row's last voltages and its injections to a lane, and impose the set-points."""
+    i, column = lanes.row[lane], np.uint64(lane)
+    magnitude, angle, injection = flow.magnitude[i], flow.angle[i], flow.injection[i]
+    for node in range(flow.n_node[i]):
+        lanes.magnitude[node, column] = magnitude[node]
+        lanes.angle[node, column] = angle[node]
+        lanes.injection[node, 0, column] = injection[node, 0]
+        lanes.injection[node, 1, column] = injection[node, 1]
+    gen_node = flow.gen_node[i]
+    for gen in range(gen_node.shape[0]):
+        lanes.magnitude[gen_node[gen], column] = gen_v[gen]
+    lanes.state[lane] = RUNNING
+    lanes.renewed[lane] = False
+
+
+@borrowing_jit
+def _gather_factors(flow: FlowState, lanes: WarmLanes, n: Index, n_values: Index) -> None:
+    """Copy the factors of all rows to their lanes."""
+    whole = n_values - n_values % WIDTH if n == WIDTH else 0
+    for k in range(0, whole, WIDTH):
+        load_columns(flow.panel, lanes.row, k, lanes.panel)
+    for lane in range(n):
+        panel, column = flow.panel[lanes.row[lane]], np.uint64(lane)
+        for k in range(whole, n_values):
+            lanes.panel[k, column] = panel[k]
+
+
+@borrowing_jit
+def _scatter_factors(flow: FlowState, lanes: WarmLanes, n: Index, n_values: Index) -> None:
+    """Copy new factors of lanes that are done to their rows."""
+    n_changed = 0
+    for lane in range(n):
+        n_changed += lanes.state[lane] == DONE and lanes.renewed[lane]
+    whole = n_values - n_values % WIDTH if n_changed == WIDTH else 0
+    for k in range(0, whole, WIDTH):
+        store_columns(flow.panel, lanes.row, k, lanes.panel)
+    for lane in range(n):
+        if lanes.state[lane] != DONE or not lanes.renewed[lane]:
+            continue
+        panel, column = flow.panel[lanes.row[lane]], np.uint64(lane)
+        for k in range(whole, n_values):
+            panel[k] = lanes.panel[k, column]
+
+
+@borrowing_jit
+def _judge(lanes: WarmLanes, n: Index, n_steps: int, tolerance: float) -> bool:
+    """Decide which lanes take another step, and which of them with new factors; whether any does."""
+    for lane in range(WIDTH):
+        lanes.active[0, lane] = 0.0
+        lanes.renews[0, lane] = 0.0
+    for lane in range(n):
+        if lanes.state[lane] != RUNNING:
+            continue
+        mismatch = lanes.mismatch[0, lane]
+        ratio = mismatch / lanes.mismatch_before[0, lane] if n_steps > 0 else 0.0
+        verdict = judge_warm(n_steps, mismatch, ratio, tolerance)
+        if verdict == ARRIVED:
+            lanes.state[lane] = DONE
+        elif verdict == STUCK:
+            lanes.state[lane] = FAILED
+        else:
+            lanes.active[0, lane] = 1.0
+            lanes.renews[0, lane] = 1.0 if verdict == RENEW else 0.0
+    return _any(lanes.active, n)
+
+
+@borrowing_jit
+def _any(marks: Lanes, n: Index) -> bool:
+    marked = False
+    for lane in range(n):
+        marked |= marks[0, lane] > 0.0
+    return marked
+
+
+@borrowing_jit
+def _take_new_factors(lanes: WarmLanes, n: Index, n_values: Index) -> None:
+    """Replace the factors of lanes that want new ones; those without go no further."""
+    renews = load(lanes.renews, 0)
+    for k in range(n_values):
+        store(lanes.panel, k, where_less(splat(0.0), renews, load(lanes.new_panel, k), load(lanes.panel, k)))
+    for lane in range(n):
+        if lanes.renews[0, lane] > 0.0:
+            lanes.renewed[lane] = True
+            if lanes.sound[0, lane] == 0.0:
+                lanes.state[lane] = FAILED
+
+
+@borrowing_jit
+def _hold_still(lanes: WarmLanes, equations: Equations) -> None:
+    """Let lanes that have arrived take a step of nothing."""
+    active = load(lanes.active, 0)
+    for unknown in range(equations.first_unknown[equations.n_free]):
+        store(lanes.step, unknown, where_less(splat(0.0), active, load(lanes.step, unknown), splat(0.0)))
+
+
+@borrowing_jit
+def _write_currents(network: Network, flow: FlowState, i: Index, lanes: WarmLanes) -> None:
+    voltage, origins, extremities = lanes.voltage, flow.line_or_node[i], flow.line_ex_node[i]
+    for line in range(origins.shape[0]):
+        if origins[line] == ABSENT:
+            store(lanes.current, line, splat(0.0))
+            continue
+        origin, extremity = TWO * origins[line], TWO * extremities[line]
+        current = line_current(
+            network, line, load(voltage, origin), load(voltage, origin + ONE), load(voltage, extremity),
+            load(voltage, extremity + ONE),
+        )  # fmt: skip
+        store(lanes.current, line, current)
+
+
+@borrowing_jit
+def _finish(flow: FlowState, lanes: WarmLanes, lane: Index, a_or: F32) -> None:
+    """Copy the voltages that a lane has found to its row, unless they are far from what the cold recipe found last."""
+    i, column = lanes.row[lane], np.uint64(lane)
+    magnitude, angle, voltage, anchor = flow.magnitude[i], flow.angle[i], flow.voltage[i], flow.anchor[i]
+    far = False
+    for node in range(flow.n_node[i]):
+        far |= is_far(lanes.magnitude[node, column], lanes.angle[node, column], anchor[node, 0], anchor[node, 1])
+    if far:
+        lanes.state[lane] = FAILED
+        return
+    for node in range(flow.n_node[i]):
+        magnitude[node] = lanes.magnitude[node, column]
+        angle[node] = lanes.angle[node, column]
+        voltage[node, 0] = lanes.voltage[node, 0, column]
+        voltage[node, 1] = lanes.voltage[node, 1, column]
+    for line in range(a_or.shape[0]):
+        a_or[line] = amperes(lanes.current[line, column])

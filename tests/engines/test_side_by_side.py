@@ -1,0 +1,98 @@
+"""Rows that are played together, their power flows side by side, are what they are alone, to the last bit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rl2grid.engines.native.engine import NativeEngine
+from rl2grid.engines.native.transitions import NativeTransitions, commands_of
+from rl2grid.grids import load_grid
+from rl2grid.mdp.actions import DO_NOTHING, level_catalogue
+from rl2grid.mdp.rewards import PRESETS
+from rl2grid.powerflow.lane_flow import DONE, FAILED
+from rl2grid.scenarios.episodes import plan_episode
+from rl2grid.structures import Role, fields_of
+
+N = 21
+"""Rows: more than are played at the same time, and no multiple of the lanes."""
+STEPS = 40
+
+
+class Played:
+    """Rows of a grid that are asked for together, or one by one."""
+
+    def __init__(self, grid_id: str, heuristic: str | None, together: bool) -> None:
+        self.grid, self.together = load_grid(grid_id), together
+        engine = NativeEngine(self.grid, N)
+        self.transitions = NativeTransitions(engine, heuristic, "T", PRESETS["default"], 1.0)
+        self.environments = engine.environments
+        for i in range(N):
+            self.begin(i, 0)
+        self.lane_states: set[int] = set()
+
+    def begin(self, i: int, number: int) -> None:
+        self.transitions.reset(i, plan_episode(self.grid, "bundled", i, number, start=24 * i))
+
+    def step(self, actions: list) -> None:
+        commands = commands_of(self.grid, actions)
+        if not self.together:
+            for i in range(N):
+                self.transitions.play_rows(np.array([i]), commands[i : i + 1], 1)
+            return
+        self.environments.lanes.state[:] = -1
+        self.transitions.play_rows(np.arange(N), commands, 1)
+        self.lane_states |= set(self.environments.lanes.state.tolist())
+
+    def kept(self) -> dict[str, np.ndarray]:
+        """All that is kept from step to step, but for addresses."""
+        found = {}
+        for part in ("state", "hidden", "flow", "opponent"):
+            structure = getattr(self.environments, part)
+            for name in fields_of(type(structure), Role.KEPT, Role.EPISODE):
+                found[f"{part}.{name}"] = getattr(structure, name)
+        return found
+
+
+def disturb(played: Played, random: np.random.Generator) -> None:
+    """Give some rows factors and anchors that are not theirs: they need more steps, new factors or the cold recipe."""
+    flow = played.environments.flow
+    for i in range(N):
+        spoiled = random.random()
+        if spoiled < 0.15:
+            flow.panel[i] *= random.uniform(0.8, 1.2)
+        elif spoiled < 0.2:
+            flow.panel[i] *= -1.0
+        elif spoiled < 0.25:
+            flow.anchor[i, 0, 0] += 1.0
+        elif spoiled < 0.3:
+            flow.anchor_steps[i] = 6
+
+
+@pytest.mark.parametrize(
+    ("grid_id", "heuristic"), [("bus14", None), ("bus14", "idle"), ("bus36-MO-v0", "careful"), ("bus118-MOB-v1", None)]
+)
+def test_a_row_does_not_depend_on_its_company(grid_id, heuristic):
+    both = [Played(grid_id, heuristic, together) for together in (True, False)]
+    actions = level_catalogue(both[0].grid, 0)
+    random = np.random.default_rng(7)
+    numbers = [0] * N
+    for step in range(STEPS):
+        seed = int(random.integers(2**31))
+        for played in both:
+            disturb(played, np.random.default_rng(seed))
+        chosen = [
+            actions[random.integers(len(actions))] if random.random() < 0.2 else DO_NOTHING for _ in range(N)
+        ]  # most topologies are shared by a few rows then
+        for played in both:
+            played.step(chosen)
+        together, alone = (played.kept() for played in both)
+        for name, values in together.items():
+            np.testing.assert_array_equal(values, alone[name], err_msg=f"{name} after {step + 1} steps")
+        state = both[0].environments.state
+        for i in np.flatnonzero(state.terminated | state.truncated).tolist():
+            numbers[i] += 1
+            for played in both:
+                played.begin(i, numbers[i])
+    assert {DONE, FAILED} <= both[0].lane_states, "flows were solved side by side, and some were not accepted"
+    assert not both[1].lane_states
