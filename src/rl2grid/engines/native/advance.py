@@ -52,6 +52,9 @@ _ABREAST = 16
 """Rows that a thread plays at the same time: twice as many as flows are solved side by side, because the topologies of
 rows differ."""
 
+_SPREAD = 6364136223846793005
+"""Odd, and large: different topologies are unlikely to have the same key."""
+
 Components = tuple[float, float, float]
 
 
@@ -61,6 +64,7 @@ def advance(
     simulated: int,
     security: int,
     rows: NDArray[np.int64],
+    order: NDArray[np.int64],
     counter: NDArray[np.int64],
     begins: bool,
     first: NDArray[np.int64],
@@ -83,6 +87,7 @@ def advance(
         security: address of a handle to the :class:`~rl2grid.mdp.security.Security` of the thread, for those that
             look at it.
         rows: environments, int64 [k].
+        order: in which they are played, int64 [k]; nothing but time depends on it. See :func:`write_topology_keys`.
         counter: int64 [1], how many of ``rows`` were taken so far, by all threads that play them together.
         begins: the first rows of episodes are shown; nobody acts.
         first: the first change of each agent's action, int64 [k].
@@ -102,13 +107,14 @@ def advance(
     under_way, status = np.empty(_ABREAST, np.int64), np.empty(_ABREAST, np.int64)
     is_agents_step = np.empty(_ABREAST, np.bool_)
     illegal, ambiguous = np.empty(_ABREAST, np.bool_), np.empty(_ABREAST, np.bool_)
-    n = k = 0
+    n = taken = 0
     while True:
         # Heuristics play some rows a hundred times as long as others: who is done takes the next.
-        while n < _ABREAST and k < rows.shape[0]:
-            k = take_next(np.int64(counter.ctypes.data))  # type: ignore[call-arg]
-            if k >= rows.shape[0]:
+        while n < _ABREAST and taken < rows.shape[0]:
+            taken = take_next(np.int64(counter.ctypes.data))  # type: ignore[call-arg]
+            if taken >= rows.shape[0]:
                 break
+            k = order[taken]
             i = rows[k]
             under_way[n], is_agents_step[n], illegal[n], ambiguous[n] = i, not begins, False, False
             if begins:
@@ -140,6 +146,34 @@ def advance(
                 continue
             under_way[n], is_agents_step[n], illegal[n], ambiguous[n] = i, False, illegal[slot], ambiguous[slot]
             n += 1
+
+
+@jit
+def write_topology_keys(
+    address: int,
+    rows: NDArray[np.int64],
+    first: NDArray[np.int64],
+    end: NDArray[np.int64],
+    kinds: NDArray[np.int64],
+    targets: NDArray[np.int64],
+    masks: NDArray[np.uint64],
+    keys: NDArray[np.int64],
+) -> None:
+    """Write a number of each of ``rows`` that is the same where topology and action are, int64 [k].
+
+    Played in its order, rows of one topology are played at the same time, and their power flows solved side by side.
+    Arguments as of :func:`advance`.
+    """
+    state = open_environments(address).state
+    for k in range(rows.shape[0]):
+        busbar, key = state.topo_vect[rows[k]], np.int64(0)
+        for element in range(busbar.shape[0]):
+            key += busbar[element] * (_SPREAD * element + 1)
+        for change in range(first[k], end[k]):
+            key = (key + kinds[change]) * _SPREAD + targets[change]
+            for word in range(masks.shape[1]):
+                key = key * _SPREAD + np.int64(masks[change, word])
+        keys[k] = key
 
 
 @jit

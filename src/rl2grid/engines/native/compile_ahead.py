@@ -20,6 +20,7 @@ SIGNATURE = (
     types.int64,  # simulated
     types.int64,  # security
     _NUMBERS,  # rows
+    _NUMBERS,  # order
     _NUMBERS,  # counter
     types.boolean,  # begins
     _NUMBERS,  # first

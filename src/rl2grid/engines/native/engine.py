@@ -165,13 +165,13 @@ class NativeEngine:
         self, library: TrainingLibrary, rows: I64, draws: Draws, maintained: bool, n_steps: int = MAX_STEPS
     ) -> list[EpisodePlan]:
         """Note what was begun in ``rows``; returns the plans of the episodes."""
-        hidden, plans = self.environments.hidden, []
-        for i, seed, number, year, month, start, redraws in zip(
-            rows.tolist(), *map(np.ndarray.tolist, draws), strict=True
+        series, forecasts, plans = self.environments.hidden.series[rows], self.environments.hidden.forecast[rows], []
+        for k, (i, seed, number, year, month, start, redraws) in enumerate(
+            zip(rows.tolist(), *map(np.ndarray.tolist, draws), strict=True)
         ):
             months = library.months(year, month)
             name = SeriesName(months.id, months.content_hash, start)
-            self._playing[i] = self._true[i] = Playing(name, months, hidden.series[i].copy(), hidden.forecast[i].copy())
+            self._playing[i] = self._true[i] = Playing(name, months, series[k], forecasts[k])
             plans.append(EpisodePlan(seed, number, months.id, start, n_steps, maintained, redraws))
         return plans
 

@@ -28,6 +28,7 @@ from rl2grid.engines.native.advance import (
     SECURE_RECONNECT,
     advance,
     write_observations,
+    write_topology_keys,
 )
 from rl2grid.engines.native.beginning import Draws
 from rl2grid.engines.native.compile_ahead import compile_ahead
@@ -312,12 +313,28 @@ class NativeTransitions(Transitions):
         return effects
 
     def _advance(self, rows: I64, commands: Commands, num_threads: int, begins: bool) -> None:
-        counter = np.zeros(1, np.int64)
+        counter, order = np.zeros(1, np.int64), self._order(rows, commands)
 
         def advance_some(thread: int, _: slice) -> None:
-            self._advance_some(thread, rows, counter, commands, begins)
+            self._advance_some(thread, rows, order, counter, commands, begins)
 
         self._in_threads(advance_some, len(rows), num_threads)
+
+    def _order(self, rows: I64, commands: Commands) -> I64:
+        """In which to play ``rows``: those together that will have one topology."""
+        keys = np.zeros_like(rows)
+        if len(rows) > 1:
+            write_topology_keys(
+                self.engine.address,
+                rows,
+                commands.first,
+                commands.end,
+                commands.kinds,
+                commands.targets,
+                commands.masks,
+                keys,
+            )
+        return keys.argsort(kind="stable")
 
     def _in_threads(self, play: Callable[[int, slice], None], n_rows: int, num_threads: int) -> None:
         """Call ``play`` with the number of a thread and a part of ``n_rows`` rows, in as many threads as pay off."""
@@ -344,11 +361,12 @@ class NativeTransitions(Transitions):
             self._securities.append(Handle(own))
         return self._securities[thread].address
 
-    def _advance_some(self, thread: int, rows: I64, counter: I64, commands: Commands, begins: bool) -> None:
+    def _advance_some(self, thread: int, rows: I64, order: I64, counter: I64, commands: Commands, begins: bool) -> None:
         weights = self.reward.weights
         advance(
             *self._addresses(thread),
             rows,
+            order,
             counter,
             begins,
             commands.first,
