@@ -60,6 +60,13 @@ def test_allocation_follows_from_the_declaration():
     check(example)
 
 
+def test_arrays_begin_where_a_line_of_the_cache_does():
+    example = allocate(Example, {"line": 3}, 5)
+    for made in (example, with_own_workspace(example)):
+        assert made.step.ctypes.data % 64 == 0
+    assert with_own_workspace(example).step.ctypes.data != example.step.ctypes.data
+
+
 @pytest.mark.parametrize("wrong", [np.zeros((5, 3)), np.zeros((5, 3, 1), np.float32), np.zeros((3, 5), np.float32).T])
 def test_an_array_that_is_not_as_declared_is_refused(wrong):
     with pytest.raises(TypeError, match=r"Example\.rho has to be a contiguous float32 array with 2 axes"):
