@@ -8,7 +8,8 @@ Every case is a task, a heuristic and a way to play: random actions, mostly noth
 processes of their own, 24 environments for so many decisions (a twentieth of them where a heuristic plays between
 decisions). After every tenth of the case the two are compared: observations, rewards, ends, and all arrays that an
 environment keeps from step to step, voltages and factors of the power flow included. What a later revision keeps
-besides is not looked at.
+besides is not looked at, nor is the sign of a zero in what is kept (sums and products of numbers that agree but for it
+agree but for it, and nothing is divided by zero).
 
 It writes ``benchmarks/results/same_bits.json``: grid steps that were compared, and what differed, by case.
 """
@@ -59,6 +60,8 @@ def kept(environments):
         structure = getattr(environments, part)
         for name in fields_of(type(structure), Role.KEPT, Role.EPISODE):
             values = np.ascontiguousarray(getattr(structure, name))
+            if values.dtype.kind == "f":
+                values = values + 0.0  # a zero is a zero, whatever its sign
             found[f"{part}.{name}"] = hashlib.sha256(values.tobytes()).hexdigest()[:16]
     return found
 

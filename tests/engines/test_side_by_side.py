@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 
 from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.engines.native.transitions import NativeTransitions, commands_of
 from rl2grid.grids import load_grid
-from rl2grid.mdp.actions import DO_NOTHING, level_catalogue
+from rl2grid.mdp.actions import DO_NOTHING, StepAction, full_catalogue, level_catalogue
 from rl2grid.mdp.rewards import PRESETS
+from rl2grid.powerflow.flow_lanes import LOST
 from rl2grid.powerflow.lane_flow import DONE, FAILED
 from rl2grid.scenarios.episodes import plan_episode
 from rl2grid.structures import Role, fields_of
@@ -74,16 +77,31 @@ def disturb(played: Played, random: np.random.Generator) -> None:
 )
 def test_a_row_does_not_depend_on_its_company(grid_id, heuristic):
     both = [Played(grid_id, heuristic, together) for together in (True, False)]
-    actions = level_catalogue(both[0].grid, 0)
+    play_both(both, level_catalogue(both[0].grid, 0), 0.2)  # most topologies are shared by a few rows then
+    assert {DONE, FAILED} <= both[0].lane_states, "flows were solved side by side, and some were not accepted"
+    assert not both[1].lane_states
+
+
+@pytest.mark.parametrize(("grid_id", "share"), [("bus14", 0.5), ("bus36-M", 0.9), ("bus118-M", 0.9)])
+def test_a_row_of_a_topology_of_its_own_does_not_depend_on_its_company(grid_id, share):
+    both = [Played(grid_id, None, together) for together in (True, False)]
+    play_both(both, full_catalogue(both[0].grid), share)
+    used = [played.environments.union.exists.any() for played in both]
+    assert used == [True, False], "flows of different topologies were solved side by side"
+    assert DONE in both[0].lane_states
+    if grid_id == "bus14":
+        assert LOST in both[0].lane_states, "some diverged"
+
+
+def play_both(both: list[Played], actions: Sequence[StepAction], share: float) -> None:
+    """Play the same in both, random actions in some rows, and compare all that they keep."""
     random = np.random.default_rng(7)
     numbers = [0] * N
     for step in range(STEPS):
         seed = int(random.integers(2**31))
         for played in both:
             disturb(played, np.random.default_rng(seed))
-        chosen = [
-            actions[random.integers(len(actions))] if random.random() < 0.2 else DO_NOTHING for _ in range(N)
-        ]  # most topologies are shared by a few rows then
+        chosen = [actions[random.integers(len(actions))] if random.random() < share else DO_NOTHING for _ in range(N)]
         for played in both:
             played.step(chosen)
         together, alone = (played.kept() for played in both)
@@ -94,5 +112,3 @@ def test_a_row_does_not_depend_on_its_company(grid_id, heuristic):
             numbers[i] += 1
             for played in both:
                 played.begin(i, numbers[i])
-    assert {DONE, FAILED} <= both[0].lane_states, "flows were solved side by side, and some were not accepted"
-    assert not both[1].lane_states

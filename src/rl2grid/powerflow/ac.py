@@ -11,7 +11,7 @@ from rl2grid.compile import borrowing_jit, owning_jit
 from rl2grid.powerflow.flow_state import ABSENT, Equations, Factors, FlowState, forget_flow, new_flow_state
 from rl2grid.powerflow.lanes import root, where_less
 from rl2grid.powerflow.model import Network
-from rl2grid.powerflow.newton import may_go_on, solve_cold, solve_warm
+from rl2grid.powerflow.newton import go_on_cold, may_go_on, solve_cold, solve_warm
 from rl2grid.powerflow.topology import build_nodes, is_same_topology, measure_pattern, remember_topology, write_pattern
 
 __all__ = [
@@ -127,11 +127,34 @@ def solve_flow(network: Network, flow: FlowState, i: int, topo_vect: I32, gen_v:
 @borrowing_jit
 def _solve(network: Network, flow: FlowState, i: int, gen_v: F32 | F64, column: U16, panel: F64) -> bool:
     """Solve from the voltages of the last flow if that may be, else cold."""
-    n_free = np.int64(flow.n_node[i]) - 1
-    first_unknown = flow.first_unknown[i]
-    equations = Equations(
-        n_free,
-        first_unknown,
+    equations, factors = _equations_of(flow, i), _factors_of(flow, i, column, panel)
+    if may_go_on(flow, i) and solve_warm(network, flow, i, gen_v, equations, factors):
+        return True
+    _write_start(flow, i, gen_v)
+    return solve_cold(network, flow, i, equations, factors)
+
+
+@borrowing_jit
+def finish_cold(network: Network, flow: FlowState, i: int, n_steps: int, ratio: float) -> bool:
+    """Solve alone what was begun cold beside others; whether it converges.
+
+    Args:
+        network: electrical model of the grid.
+        flow: row ``i`` holds the voltages and factors that it has come to.
+        i: row.
+        n_steps: Newton steps behind it.
+        ratio: of the mismatch to the one before the last of them, infinite before the first.
+    """
+    equations, factors = _equations_of(flow, i), _factors_of(flow, i, flow.column[i], flow.panel[i])
+    flow.warm[i] = go_on_cold(network, flow, i, equations, factors, n_steps, ratio)
+    return bool(flow.warm[i])
+
+
+@borrowing_jit
+def _equations_of(flow: FlowState, i: int) -> Equations:
+    return Equations(
+        np.int64(flow.n_node[i]) - 1,
+        flow.first_unknown[i],
         flow.admittance_first[i],
         flow.admittance_node[i],
         flow.admittance[i],
@@ -143,9 +166,13 @@ def _solve(network: Network, flow: FlowState, i: int, gen_v: F32 | F64, column: 
         flow.power[i],
         flow.step,
     )
-    factors = Factors(
-        n_free,
-        first_unknown,
+
+
+@borrowing_jit
+def _factors_of(flow: FlowState, i: int, column: U16, panel: F64) -> Factors:
+    return Factors(
+        np.int64(flow.n_node[i]) - 1,
+        flow.first_unknown[i],
         flow.node_of_unknown[i],
         flow.first_column[i],
         flow.own_column[i],
@@ -155,10 +182,6 @@ def _solve(network: Network, flow: FlowState, i: int, gen_v: F32 | F64, column: 
         panel,
         flow.sparse_row,
     )
-    if may_go_on(flow, i) and solve_warm(network, flow, i, gen_v, equations, factors):
-        return True
-    _write_start(flow, i, gen_v)
-    return solve_cold(network, flow, i, equations, factors)
 
 
 @owning_jit

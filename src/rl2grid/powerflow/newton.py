@@ -1,7 +1,7 @@
 """Newton's method in polar coordinates on the nodes of one environment.
 
 Magnitudes are solved for relative to themselves. The equations are written once, for one environment and for lanes of
-several (:mod:`rl2grid.powerflow.warm_lanes`), which therefore find the same bits.
+several (:mod:`rl2grid.powerflow.warm_lanes`, :mod:`rl2grid.powerflow.cold_lanes`), which therefore find the same bits.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _WARM_STEPS = 8
 _SLOWEST = 0.5
 """A warm step that leaves more of the mismatch than this is no good step."""
 ARRIVED, STUCK, RENEW, STEP = range(4)
-"""What becomes of a warm flow: it is solved; it is left to the cold recipe; it needs new factors for its next step; or
+"""What becomes of a flow: it is solved; it cannot be solved in this way; it needs new factors for its next step; or
 it takes another with those that it has."""
 _MAGNITUDE_RANGE = 0.03
 _ANGLE_RANGE = 0.1
@@ -85,8 +85,9 @@ def measure_mismatch(equations: Equations) -> Any:
         for entry in range(first[node], first[node + 1]):
             other = TWO * column[entry]
             e, f = _part_at(voltage, other), _part_at(voltage, other + ONE)
-            real += value[entry, 0] * e - value[entry, 1] * f
-            imaginary += value[entry, 0] * f + value[entry, 1] * e
+            conductance, susceptance = _part_at(value, 2 * entry), _part_at(value, 2 * entry + 1)
+            real += conductance * e - susceptance * f
+            imaginary += conductance * f + susceptance * e
         e, f = _part_at(voltage, 2 * node), _part_at(voltage, 2 * node + 1)
         active, reactive = e * real + f * imaginary, f * real - e * imaginary
         _set_part(power, 2 * node, active)
@@ -120,8 +121,9 @@ def fill_jacobian(equations: Equations, factors: Factors) -> None:
             if other >= n_free:
                 continue
             e2, f2 = _part_at(voltage, TWO * other), _part_at(voltage, TWO * other + ONE)
-            real = value[entry, 0] * e2 - value[entry, 1] * f2
-            imaginary = value[entry, 0] * f2 + value[entry, 1] * e2
+            conductance, susceptance = _part_at(value, 2 * entry), _part_at(value, 2 * entry + 1)
+            real = conductance * e2 - susceptance * f2
+            imaginary = conductance * f2 + susceptance * e2
             along = e * real + f * imaginary
             across = f * real - e * imaginary
             p_angle, p_magnitude, q_angle, q_magnitude = across, along, -along, across
@@ -215,17 +217,26 @@ def solve_cold(network: Network, flow: FlowState, i: int, equations: Equations, 
         angle[node] = step[equations.first_unknown[node]]
     angle[equations.n_free] = 0.0
     write_voltage(equations)
-    tolerance = network.tolerance[0]
+    return go_on_cold(network, flow, i, equations, factors, 0, math.inf)
+
+
+@borrowing_jit
+def go_on_cold(
+    network: Network, flow: FlowState, i: int, equations: Equations, factors: Factors, n_steps: int, ratio: float
+) -> bool:
+    """Take Newton steps from where a cold flow stands: ``n_steps`` behind it, ``ratio`` as of :func:`judge_cold`.
+
+    Other arguments and what it returns are as of :func:`solve_cold`.
+    """
     mismatch = measure_mismatch(equations)
-    ratio = math.inf
-    for iteration in range(network.max_iterations[0]):
-        if mismatch < tolerance:
-            _drop_anchor(flow, i, iteration)
+    while True:
+        verdict = judge_cold(n_steps, mismatch, ratio, network.tolerance[0], network.max_iterations[0])
+        if verdict == ARRIVED:
+            drop_anchor(flow, i, n_steps)
             return True
-        if not math.isfinite(mismatch):
+        if verdict == STUCK:
             return False
-        # So close to the solution the last factors do as well as new ones, and a full step would surely converge.
-        if iteration > _TRUSTED_STEPS or not mismatch * (4.0 * ratio) ** 2 < tolerance:
+        if verdict == RENEW:
             fill_jacobian(equations, factors)
             if factorise(factors) == 0.0:
                 return False
@@ -234,14 +245,30 @@ def solve_cold(network: Network, flow: FlowState, i: int, equations: Equations, 
         before = mismatch
         mismatch = measure_mismatch(equations)
         ratio = mismatch / before
-    if not mismatch < tolerance:
-        return False
-    _drop_anchor(flow, i, network.max_iterations[0])
-    return True
+        n_steps += 1
 
 
 @borrowing_jit
-def _drop_anchor(flow: FlowState, i: int, n_steps: int) -> None:
+def judge_cold(n_steps: int, mismatch: float, ratio: float, tolerance: float, most_steps: int) -> int:
+    """How a flow goes on that began at unit magnitudes: ARRIVED, STUCK, RENEW or STEP.
+
+    Args:
+        n_steps: that it has taken.
+        mismatch: that they have left, per unit.
+        ratio: of that to the one before the last step, infinite before the first.
+        tolerance: per unit.
+        most_steps: that it may take.
+    """
+    if mismatch < tolerance:
+        return ARRIVED
+    if n_steps == most_steps or not math.isfinite(mismatch):
+        return STUCK
+    # So close to the solution the last factors do as well as new ones, and a full step would surely converge.
+    return STEP if n_steps <= _TRUSTED_STEPS and mismatch * (4.0 * ratio) ** 2 < tolerance else RENEW
+
+
+@borrowing_jit
+def drop_anchor(flow: FlowState, i: int, n_steps: int) -> None:
     """Remember a solution that the cold recipe found, and in how many steps."""
     magnitude, angle, anchor = flow.magnitude[i], flow.angle[i], flow.anchor[i]
     for node in range(flow.n_node[i]):

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from rl2grid.arrays import I32, U16, U64, Index
+from rl2grid.arrays import I32, U16, U32, U64, Index
 from rl2grid.compile import borrowing_jit
 from rl2grid.powerflow.bits import count_bits, lowest_bit
 from rl2grid.powerflow.flow_state import ABSENT, FlowState
 from rl2grid.powerflow.model import Network
 
 _ONE = np.uint64(1)
-_ADJACENT, _LOWER, _UPPER = 0, 1, 2
+ADJACENT, _LOWER, _UPPER = 0, 1, 2
 """Sets of each node: joined by a line (itself included); filled columns before and after the diagonal."""
 
 
@@ -43,7 +43,7 @@ def build_nodes(network: Network, flow: FlowState, i: int, topo_vect: I32) -> bo
         return False
     _number_nodes(network, flow, i)
     n_node = np.int64(flow.n_node[i])
-    adjacent = flow.sets[_ADJACENT]
+    adjacent = flow.sets[ADJACENT]
     _join_nodes(flow.line_or_node[i], flow.line_ex_node[i], n_node, adjacent)
     if not _is_connected(n_node, adjacent, flow.sets[_LOWER], flow.diagonal_entry[i]):
         return False
@@ -141,19 +141,25 @@ def _rename(node_of_bus: U16, place: U16) -> None:
 
 
 @borrowing_jit
-def _join_nodes(line_or: U16, line_ex: U16, n_node: Index, adjacent: U64) -> None:
+def join_themselves(n_node: Index, adjacent: U64) -> None:
+    """Let each of the first nodes have no neighbour but itself."""
     for node in range(n_node):
         for word in range(adjacent.shape[1]):
             adjacent[node, word] = 0
-        _insert(adjacent, node, node)
-    for line in range(line_or.shape[0]):
-        if line_or[line] != ABSENT:
-            _insert(adjacent, line_or[line], line_ex[line])
-            _insert(adjacent, line_ex[line], line_or[line])
+        insert(adjacent, node, node)
 
 
 @borrowing_jit
-def _insert(sets: U64, k: Index, node: Index) -> None:
+def _join_nodes(line_or: U16, line_ex: U16, n_node: Index, adjacent: U64) -> None:
+    join_themselves(n_node, adjacent)
+    for line in range(line_or.shape[0]):
+        if line_or[line] != ABSENT:
+            insert(adjacent, line_or[line], line_ex[line])
+            insert(adjacent, line_ex[line], line_or[line])
+
+
+@borrowing_jit
+def insert(sets: U64, k: Index, node: Index) -> None:
     """Add a node to set ``k``."""
     sets[k, node >> 6] |= _ONE << np.uint64(node & 63)
 
@@ -171,7 +177,7 @@ def _is_connected(n_node: Index, adjacent: U64, reached: U64, queue: U16) -> boo
     words = adjacent.shape[1]
     for word in range(words):
         reached[0, word] = 0
-    _insert(reached, 0, slack)
+    insert(reached, 0, slack)
     queue[0] = slack
     n_reached, visited = 1, 0
     while visited < n_reached:
@@ -198,11 +204,9 @@ def _entry(first: U16, adjacent: U64, row: Index, node: Index) -> np.int64:
 
 
 @borrowing_jit
-def _fill_admittance(network: Network, flow: FlowState, i: int, adjacent: U64) -> None:
-    n_node = np.int64(flow.n_node[i])
-    first, columns, values = flow.admittance_first[i], flow.admittance_node[i], flow.admittance[i]
-    diagonal = flow.diagonal_entry[i]
-    entry = 0
+def write_entries(n_node: np.int64, adjacent: U64, first: U16, columns: U16, diagonal: U16) -> np.int64:
+    """Write where the entries of an admittance matrix are; how many it has."""
+    entry = np.int64(0)
     for node in range(n_node):
         first[node] = entry
         for word in range(adjacent.shape[1]):
@@ -213,10 +217,18 @@ def _fill_admittance(network: Network, flow: FlowState, i: int, adjacent: U64) -
                 if other == node:
                     diagonal[node] = entry
                 columns[entry] = other
-                values[entry, 0] = 0.0
-                values[entry, 1] = 0.0
                 entry += 1
     first[n_node] = entry
+    return entry
+
+
+@borrowing_jit
+def _fill_admittance(network: Network, flow: FlowState, i: int, adjacent: U64) -> None:
+    first, columns, values = flow.admittance_first[i], flow.admittance_node[i], flow.admittance[i]
+    diagonal = flow.diagonal_entry[i]
+    for entry in range(write_entries(np.int64(flow.n_node[i]), adjacent, first, columns, diagonal)):
+        values[entry, 0] = 0.0
+        values[entry, 1] = 0.0
     line_or, line_ex, line_entry = flow.line_or_node[i], flow.line_ex_node[i], flow.line_entry[i]
     for line in range(line_or.shape[0]):
         origin, extremity = line_or[line], line_ex[line]
@@ -239,8 +251,19 @@ def _fill_admittance(network: Network, flow: FlowState, i: int, adjacent: U64) -
 def measure_pattern(flow: FlowState, i: int) -> tuple[np.int64, np.int64]:
     """Find the fill of the factors of row ``i``; how many columns and values they have."""
     n_free = np.int64(flow.n_node[i]) - 1
-    first_unknown = flow.first_unknown[i]
-    adjacent, lower, upper = flow.sets[_ADJACENT], flow.sets[_LOWER], flow.sets[_UPPER]
+    return measure_fill(n_free, flow.first_unknown[i], flow.sets, flow.first_column[i], flow.first_panel[i])
+
+
+@borrowing_jit
+def measure_fill(
+    n_free: np.int64, first_unknown: U16, sets: U64, first_column: U32, first_panel: U32
+) -> tuple[np.int64, np.int64]:
+    """Find the fill of the factors of a matrix, whose nodes' neighbours are in ``sets``; arrays as in ``FlowState``.
+
+    Returns:
+        How many columns and values the factors have.
+    """
+    adjacent, lower, upper = sets[ADJACENT], sets[_LOWER], sets[_UPPER]
     words = adjacent.shape[1]
     for node in range(n_free):
         for word in range(words):
@@ -251,15 +274,14 @@ def measure_pattern(flow: FlowState, i: int) -> tuple[np.int64, np.int64]:
         for word in range(words):
             rest = upper[node, word]
             while rest != 0:
-                _insert(lower, 64 * word + lowest_bit(rest), node)
+                insert(lower, 64 * word + lowest_bit(rest), node)
                 rest &= rest - _ONE
     pairs = n_free  # the slack's set is free
     for word in range(words):
         upper[pairs, word] = 0
     for node in range(n_free):
         if first_unknown[node + 1] - first_unknown[node] == 2:
-            _insert(upper, pairs, node)
-    first_column, first_panel = flow.first_column[i], flow.first_panel[i]
+            insert(upper, pairs, node)
     columns = values = np.int64(0)
     for node in range(n_free):
         first_column[node] = columns
@@ -306,12 +328,29 @@ def _eliminate(node: Index, n_free: Index, adjacent: U64, upper: U64) -> None:
 def write_pattern(flow: FlowState, i: int, column: U16) -> None:
     """Write the columns of the factors of row ``i`` and where the Jacobian's blocks go."""
     n_free = np.int64(flow.n_node[i]) - 1
-    first_unknown, first_column = flow.first_unknown[i], flow.first_column[i]
-    own_column, own_panel, first_panel = flow.own_column[i], flow.own_panel[i], flow.first_panel[i]
-    entry_first, entry_node = flow.admittance_first[i], flow.admittance_node[i]
-    entry_panel = flow.admittance_panel[i]
-    lower, upper = flow.sets[_LOWER], flow.sets[_UPPER]
-    place = flow.sets[_ADJACENT]  # no longer needed: now where each node's columns are
+    write_fill(
+        n_free, flow.first_unknown[i], flow.sets, flow.first_column[i], flow.own_column[i], flow.first_panel[i],
+        flow.own_panel[i], flow.admittance_first[i], flow.admittance_node[i], flow.admittance_panel[i], column,
+    )  # fmt: skip
+
+
+@borrowing_jit
+def write_fill(
+    n_free: np.int64,
+    first_unknown: U16,
+    sets: U64,
+    first_column: U32,
+    own_column: U32,
+    first_panel: U32,
+    own_panel: U32,
+    entry_first: U16,
+    entry_node: U16,
+    entry_panel: U32,
+    column: U16,
+) -> None:
+    """Write the columns of factors that :func:`measure_fill` has measured, and where the Jacobian's blocks go."""
+    lower, upper = sets[_LOWER], sets[_UPPER]
+    place = sets[ADJACENT]  # no longer needed: now where each node's columns are
     for node in range(n_free):
         at = _write_columns(lower, node, np.int64(first_column[node]), first_unknown, column, place)
         size = np.int64(first_unknown[node + 1]) - np.int64(first_unknown[node])

@@ -7,17 +7,16 @@ cannot accept stays as it was, for :func:`rl2grid.powerflow.ac.solve_flow` to de
 
 from __future__ import annotations
 
-from typing import Annotated, NamedTuple
-
 import numpy as np
 
-from rl2grid.arrays import F32, F64, I8, I64, Flags, Index
+from rl2grid.arrays import F32, F64, Index
 from rl2grid.compile import borrowing_jit
 from rl2grid.powerflow.ac import amperes, line_current
 from rl2grid.powerflow.factors import ONE, TWO, factorise, solve
+from rl2grid.powerflow.flow_lanes import FlowLanes, any_marked, give_up_singular, hold_still, take_new_factors
 from rl2grid.powerflow.flow_state import ABSENT, Equations, Factors, FlowState
 from rl2grid.powerflow.lane_flow import DONE, FAILED, RUNNING
-from rl2grid.powerflow.lanes import WIDTH, Lanes, load, load_columns, splat, store, store_columns, where_less
+from rl2grid.powerflow.lanes import WIDTH, load, load_columns, splat, store, store_columns
 from rl2grid.powerflow.model import Network
 from rl2grid.powerflow.newton import (
     ARRIVED,
@@ -30,48 +29,11 @@ from rl2grid.powerflow.newton import (
     measure_mismatch,
     write_voltage,
 )
-from rl2grid.structures import allocate, workspace
-
-
-class WarmLanes(NamedTuple):
-    """Power flows side by side; what is not explained is as in :class:`~rl2grid.powerflow.flow_state.FlowState`."""
-
-    magnitude: Annotated[Lanes, workspace("bus lane")]
-    angle: Annotated[Lanes, workspace("bus lane")]
-    voltage: Annotated[Lanes, workspace("bus 2 lane")]
-    injection: Annotated[Lanes, workspace("bus 2 lane")]
-    power: Annotated[Lanes, workspace("bus 2 lane")]
-    step: Annotated[Lanes, workspace("unknown lane")]
-    panel: Annotated[Lanes, workspace("value lane")]
-    new_panel: Annotated[Lanes, workspace("value lane", "factors at the present voltages, of lanes that want them")]
-    sparse_row: Annotated[Lanes, workspace("unknown 2 lane")]
-    mismatch: Annotated[Lanes, workspace("1 lane", "largest, not a number if any is not finite", "per unit")]
-    mismatch_before: Annotated[Lanes, workspace("1 lane", "a step ago", "per unit")]
-    active: Annotated[Lanes, workspace("1 lane", "1.0 in lanes that take a step")]
-    renews: Annotated[Lanes, workspace("1 lane", "1.0 in lanes that want new factors for it")]
-    sound: Annotated[Lanes, workspace("1 lane", "0.0 in lanes whose new factors are of a singular matrix")]
-    current: Annotated[Lanes, workspace("line lane", "at the origin", "kA")]
-    row: Annotated[I64, workspace("lane", "that it works for")]
-    place: Annotated[I64, workspace("lane", "of the row among those of the caller")]
-    state: Annotated[I8, workspace("lane", "RUNNING, DONE or FAILED")]
-    renewed: Annotated[Flags, workspace("lane", "the factors are not those of the last flow")]
-
-
-def new_warm_lanes(flow: FlowState) -> WarmLanes:
-    """Blank lanes for rows of ``flow``."""
-    sizes = {
-        "bus": flow.magnitude.shape[1],
-        "unknown": len(flow.step),
-        "value": flow.panel.shape[1],
-        "line": flow.line_or_node.shape[1],
-        "lane": WIDTH,
-    }
-    return allocate(WarmLanes, sizes)
 
 
 @borrowing_jit
-def solve_side_by_side(
-    network: Network, flow: FlowState, lanes: WarmLanes, n: int, gen_v: F32 | F64, a_or: F32
+def solve_warm_side_by_side(
+    network: Network, flow: FlowState, lanes: FlowLanes, n: int, gen_v: F32 | F64, a_or: F32
 ) -> None:
     """Solve the flows of the first ``n`` lanes' rows, which were prepared, have one topology and may go on.
 
@@ -109,12 +71,13 @@ def solve_side_by_side(
     store(lanes.mismatch, 0, measure_mismatch(equations))
     n_steps = 0
     while _judge(lanes, n, n_steps, network.tolerance[0]):
-        if _any(lanes.renews, n):
+        if any_marked(lanes.renews, n):
             fill_jacobian(equations, new_factors)
             store(lanes.sound, 0, factorise(new_factors))
-            _take_new_factors(lanes, n, n_values)
+            take_new_factors(lanes, lanes.panel, lanes.new_panel, n_values)
+            give_up_singular(lanes, n)
         solve(factors, lanes.step)
-        _hold_still(lanes, equations)
+        hold_still(lanes, equations)
         apply_step(equations)
         store(lanes.mismatch_before, 0, load(lanes.mismatch, 0))
         store(lanes.mismatch, 0, measure_mismatch(equations))
@@ -127,7 +90,7 @@ def solve_side_by_side(
 
 
 @borrowing_jit
-def _begin(flow: FlowState, lanes: WarmLanes, lane: Index, gen_v: F32 | F64) -> None:
+def _begin(flow: FlowState, lanes: FlowLanes, lane: Index, gen_v: F32 | F64) -> None:
     """Copy a row's last voltages and its injections to a lane, and impose the set-points."""
     i, column = lanes.row[lane], np.uint64(lane)
     magnitude, angle, injection = flow.magnitude[i], flow.angle[i], flow.injection[i]
@@ -144,7 +107,7 @@ def _begin(flow: FlowState, lanes: WarmLanes, lane: Index, gen_v: F32 | F64) -> 
 
 
 @borrowing_jit
-def _gather_factors(flow: FlowState, lanes: WarmLanes, n: Index, n_values: Index) -> None:
+def _gather_factors(flow: FlowState, lanes: FlowLanes, n: Index, n_values: Index) -> None:
     """Copy the factors of all rows to their lanes."""
     whole = n_values - n_values % WIDTH if n == WIDTH else 0
     for k in range(0, whole, WIDTH):
@@ -156,7 +119,7 @@ def _gather_factors(flow: FlowState, lanes: WarmLanes, n: Index, n_values: Index
 
 
 @borrowing_jit
-def _scatter_factors(flow: FlowState, lanes: WarmLanes, n: Index, n_values: Index) -> None:
+def _scatter_factors(flow: FlowState, lanes: FlowLanes, n: Index, n_values: Index) -> None:
     """Copy new factors of lanes that are done to their rows."""
     n_changed = 0
     for lane in range(n):
@@ -173,7 +136,7 @@ def _scatter_factors(flow: FlowState, lanes: WarmLanes, n: Index, n_values: Inde
 
 
 @borrowing_jit
-def _judge(lanes: WarmLanes, n: Index, n_steps: int, tolerance: float) -> bool:
+def _judge(lanes: FlowLanes, n: Index, n_steps: int, tolerance: float) -> bool:
     """Decide which lanes take another step, and which of them with new factors; whether any does."""
     for lane in range(WIDTH):
         lanes.active[0, lane] = 0.0
@@ -191,40 +154,11 @@ def _judge(lanes: WarmLanes, n: Index, n_steps: int, tolerance: float) -> bool:
         else:
             lanes.active[0, lane] = 1.0
             lanes.renews[0, lane] = 1.0 if verdict == RENEW else 0.0
-    return _any(lanes.active, n)
+    return any_marked(lanes.active, n)
 
 
 @borrowing_jit
-def _any(marks: Lanes, n: Index) -> bool:
-    marked = False
-    for lane in range(n):
-        marked |= marks[0, lane] > 0.0
-    return marked
-
-
-@borrowing_jit
-def _take_new_factors(lanes: WarmLanes, n: Index, n_values: Index) -> None:
-    """Replace the factors of lanes that want new ones; those without go no further."""
-    renews = load(lanes.renews, 0)
-    for k in range(n_values):
-        store(lanes.panel, k, where_less(splat(0.0), renews, load(lanes.new_panel, k), load(lanes.panel, k)))
-    for lane in range(n):
-        if lanes.renews[0, lane] > 0.0:
-            lanes.renewed[lane] = True
-            if lanes.sound[0, lane] == 0.0:
-                lanes.state[lane] = FAILED
-
-
-@borrowing_jit
-def _hold_still(lanes: WarmLanes, equations: Equations) -> None:
-    """Let lanes that have arrived take a step of nothing."""
-    active = load(lanes.active, 0)
-    for unknown in range(equations.first_unknown[equations.n_free]):
-        store(lanes.step, unknown, where_less(splat(0.0), active, load(lanes.step, unknown), splat(0.0)))
-
-
-@borrowing_jit
-def _write_currents(network: Network, flow: FlowState, i: Index, lanes: WarmLanes) -> None:
+def _write_currents(network: Network, flow: FlowState, i: Index, lanes: FlowLanes) -> None:
     voltage, origins, extremities = lanes.voltage, flow.line_or_node[i], flow.line_ex_node[i]
     for line in range(origins.shape[0]):
         if origins[line] == ABSENT:
@@ -239,7 +173,7 @@ def _write_currents(network: Network, flow: FlowState, i: Index, lanes: WarmLane
 
 
 @borrowing_jit
-def _finish(flow: FlowState, lanes: WarmLanes, lane: Index, a_or: F32) -> None:
+def _finish(flow: FlowState, lanes: FlowLanes, lane: Index, a_or: F32) -> None:
     """Copy the voltages that a lane has found to its row, unless they are far from what the cold recipe found last."""
     i, column = lanes.row[lane], np.uint64(lane)
     magnitude, angle, voltage, anchor = flow.magnitude[i], flow.angle[i], flow.voltage[i], flow.anchor[i]

@@ -310,7 +310,8 @@ class NativeEngine:
         while len(self._handles) <= thread:
             flow = with_own_workspace(self.environments.flow)
             lanes = with_own_workspace(self.environments.lanes)
-            self._handles.append(Handle(self.environments._replace(flow=flow, lanes=lanes)))
+            union = with_own_workspace(self.environments.union)
+            self._handles.append(Handle(self.environments._replace(flow=flow, lanes=lanes, union=union)))
         return self._handles[thread].address
 
     def trial_address_for(self, thread: int) -> int:

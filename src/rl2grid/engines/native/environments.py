@@ -14,8 +14,9 @@ from rl2grid.handles import opener
 from rl2grid.mdp.opponents import OpponentState, new_opponent_state
 from rl2grid.mdp.state import GridState, new_state
 from rl2grid.powerflow.ac import FlowState, new_flow_state
+from rl2grid.powerflow.cold_lanes import Union, new_union
+from rl2grid.powerflow.flow_lanes import FlowLanes, new_flow_lanes
 from rl2grid.powerflow.model import Network
-from rl2grid.powerflow.warm_lanes import WarmLanes, new_warm_lanes
 
 
 class Environments(NamedTuple):
@@ -30,7 +31,8 @@ class Environments(NamedTuple):
     state: GridState
     hidden: HiddenState
     flow: FlowState
-    lanes: WarmLanes
+    lanes: FlowLanes
+    union: Union
     opponent: OpponentState
     orders: Orders
     notes: ActionNotes
@@ -46,7 +48,8 @@ def new_environments(grid: Grid, network: Network, n: int, opponent: bool, outag
         new_state(grid, n),
         new_hidden_state(grid, n, outages),
         flow,
-        new_warm_lanes(flow),
+        new_flow_lanes(flow),
+        new_union(flow),
         new_opponent_state(attacked, n),
         new_orders(grid, n),
         new_action_notes(grid, n),

@@ -7,6 +7,9 @@ from rl2grid.engines.native.environments import Environments
 from rl2grid.engines.native.topology import open_line
 from rl2grid.powerflow.ac import CONVERGED, PREPARED, prepare_flow, solve_flow, write_currents
 
+SETTLED = 4
+"""Status of a flow after which no line trips, beside those of :mod:`rl2grid.powerflow.ac`."""
+
 
 @jit
 def flow_with_cascade(environments: Environments, i: int, soft: bool) -> bool:
@@ -22,9 +25,11 @@ def flow_with_cascade(environments: Environments, i: int, soft: bool) -> bool:
     """
     begin_cascade(environments, i)
     status = prepare(environments, i)
-    if status == PREPARED:
+    while status == PREPARED:
         status = find_flow(environments, i)
-    return status == CONVERGED and follow_cascade(environments, i, soft)
+        if status == CONVERGED:
+            status = trip_lines(environments, i, soft)
+    return status == SETTLED
 
 
 @jit
@@ -64,16 +69,16 @@ def find_flow(environments: Environments, i: int) -> int:
 
 
 @jit
-def follow_cascade(environments: Environments, i: int, soft: bool) -> bool:
-    """Trip lines after a flow, and repeat until nothing trips; as :func:`flow_with_cascade`."""
-    while _trip_lines(environments, i, soft):
-        if prepare(environments, i) != PREPARED or find_flow(environments, i) != CONVERGED:
-            return False
-    return True
+def trip_lines(environments: Environments, i: int, soft: bool) -> int:
+    """Open what the protections open after a flow; ``SETTLED`` if that is nothing, else what comes of :func:`prepare`.
+
+    Arguments as of :func:`flow_with_cascade`.
+    """
+    return prepare(environments, i) if _open_tripped(environments, i, soft) else SETTLED
 
 
 @jit
-def _trip_lines(environments: Environments, i: int, soft: bool) -> bool:
+def _open_tripped(environments: Environments, i: int, soft: bool) -> bool:
     """Open what the protections open; whether anything was opened."""
     if not _any_line_is_in_doubt(environments, i):
         return False
