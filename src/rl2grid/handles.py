@@ -69,7 +69,7 @@ class Handle(Generic[Structure]):
     @property
     def _numba_type_(self) -> HandleType:
         """What a compiled function takes it for that is called with it."""
-        return _opened_type(type(self.structure))
+        return opened_type(type(self.structure))
 
     def point_at(self, name: str, part: Handle[Any]) -> None:
         """Let compiled code see another structure of the same kind as ``name``; the caller keeps it."""
@@ -105,7 +105,8 @@ class HandleType(types.Type):  # type: ignore[misc]
 
 
 @functools.cache
-def _opened_type(kind: type[tuple[Any, ...]]) -> HandleType:
+def opened_type(kind: type[tuple[Any, ...]]) -> HandleType:
+    """What compiled code takes an opened structure for."""
     return HandleType(kind)
 
 
@@ -176,7 +177,7 @@ def _read_attribute(context: Any, builder: Any, handle: HandleType, address: Any
 
 def opener(kind: type[Structure]) -> Callable[[int], Structure]:
     """A function for compiled code that turns the address of a handle to a structure into the structure."""
-    handle = _opened_type(kind)
+    handle = opened_type(kind)
 
     @intrinsic  # type: ignore[untyped-decorator]
     def open_handle(typing_context: Any, address: Any) -> Any:

@@ -12,7 +12,7 @@ import numpy as np
 
 from rl2grid.arrays import I32, I64
 from rl2grid.compile import jit, owning_jit
-from rl2grid.engines.native.environments import Environments, open_environments
+from rl2grid.engines.native.environments import Environments, open_environments, separate
 from rl2grid.engines.native.hidden_state import LOAD_P, LOAD_Q, PROD_P, PROD_V
 from rl2grid.engines.native.series import read_row
 from rl2grid.engines.native.step import reset_row
@@ -178,7 +178,7 @@ def _is_secure(environments: Environments, i: int) -> bool:
     state, hidden = environments.state, environments.hidden
     for k in range(hidden.outage_count[i]):
         if hidden.outage_begin[i, k] <= 0:
-            return _is_secure_in_service(environments, i)
+            return bool(_is_secure_in_service(environments, i))
     if state.terminated[i]:
         return False
     overloaded = 0
@@ -187,8 +187,8 @@ def _is_secure(environments: Environments, i: int) -> bool:
     return overloaded == 0
 
 
-@owning_jit
-def _is_secure_in_service(environments: Environments, i: int) -> bool:
+@separate
+def _is_secure_in_service(environments: Environments, i: int) -> int:
     """:func:`_is_secure` where an outage is under way: by a flow of its own, after which the row is shown again."""
     network, hidden, flow = environments.network, environments.hidden, environments.flow
     read_row(environments, i, 0)

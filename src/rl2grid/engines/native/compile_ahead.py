@@ -12,6 +12,7 @@ from rl2grid.compile import cache_directory
 from rl2grid.compile_beside import compile_beside, end_with_the_parent, take_turn
 from rl2grid.compiled_files import is_kept
 from rl2grid.engines.native.advance import advance
+from rl2grid.engines.native.environments import SEPARATE
 
 _MODULE = "rl2grid.engines.native.compile_ahead"
 _NUMBERS = types.Array(types.int64, 1, "C")
@@ -49,6 +50,8 @@ def _compile() -> None:
     turn = take_turn(cache_directory())
     if turn is not None:
         advance.compile(SIGNATURE)  # type: ignore[attr-defined]
+        for function in SEPARATE:
+            function.ready()
         turn.release()
 
 

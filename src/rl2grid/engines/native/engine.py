@@ -21,7 +21,7 @@ from rl2grid.engines.native.entry import (
     set_generators_one,
     step_one,
 )
-from rl2grid.engines.native.environments import Environments, new_environments
+from rl2grid.engines.native.environments import SEPARATE, Environments, new_environments
 from rl2grid.engines.native.hidden_state import new_hidden_state
 from rl2grid.engines.native.imagination import imagined_rows, outlook_of
 from rl2grid.engines.native.orders import write_order
@@ -79,6 +79,8 @@ class NativeEngine:
         self._playing: list[Playing | None] = [None] * n
         # Behind an imagined future: planners come back to it.
         self._true: list[Playing | None] = [None] * n
+        for function in SEPARATE:
+            function.ready()
         self._use(new_environments(grid, self.network, n, self.attacks))
         self._simulated = self._new_simulated()
         # Of threads that play transitions: a question from outside keeps its answer in the one above.

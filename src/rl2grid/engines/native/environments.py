@@ -17,6 +17,7 @@ from rl2grid.powerflow.ac import FlowState, new_flow_state
 from rl2grid.powerflow.cold_lanes import Union, new_union
 from rl2grid.powerflow.flow_lanes import FlowLanes, new_flow_lanes
 from rl2grid.powerflow.model import Network
+from rl2grid.separate_code import Separate, separate_jit
 
 
 class Environments(NamedTuple):
@@ -58,3 +59,7 @@ def new_environments(grid: Grid, network: Network, n: int, opponent: bool, outag
 
 open_environments = opener(Environments)
 """From the address of a handle to the environments, in compiled code."""
+SEPARATE: list[Separate] = []
+"""What ``separate`` has decorated; an engine makes it ready before it plays."""
+separate = separate_jit(Environments, SEPARATE)
+"""Compiles a function of environments and a number that returns an integer by itself, for compiled callers."""

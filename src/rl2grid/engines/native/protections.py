@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rl2grid.compile import jit
-from rl2grid.engines.native.environments import Environments
+from rl2grid.engines.native.environments import Environments, separate
 from rl2grid.engines.native.topology import open_line
 from rl2grid.powerflow.ac import CONVERGED, PREPARED, prepare_flow, solve_flow, write_currents
 
@@ -29,7 +29,7 @@ def flow_with_cascade(environments: Environments, i: int, soft: bool) -> bool:
         status = find_flow(environments, i)
         if status == CONVERGED:
             status = trip_lines(environments, i, soft)
-    return status == SETTLED
+    return bool(status == SETTLED)
 
 
 @jit
@@ -41,7 +41,7 @@ def begin_cascade(environments: Environments, i: int) -> None:
     hidden.running_count[i] = hidden.protection[i]
 
 
-@jit
+@separate
 def prepare(environments: Environments, i: int) -> int:
     """:func:`rl2grid.powerflow.ac.prepare_flow` with the topology and the injections of row ``i``."""
     network, state, hidden, flow = environments.network, environments.state, environments.hidden, environments.flow
@@ -58,7 +58,7 @@ def prepare(environments: Environments, i: int) -> int:
     )
 
 
-@jit
+@separate
 def find_flow(environments: Environments, i: int) -> int:
     """Solve a flow that is PREPARED, and write the currents if it is CONVERGED; its status."""
     network, state, flow = environments.network, environments.state, environments.flow

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from rl2grid.arrays import I64
 from rl2grid.compile import jit
-from rl2grid.engines.native.environments import Environments
+from rl2grid.engines.native.environments import Environments, separate
 from rl2grid.engines.native.protections import SETTLED, begin_cascade, find_flow, prepare, trip_lines
 from rl2grid.engines.native.step import begin_step, dispatch_or_lose, end_step, set_scene
 from rl2grid.powerflow.ac import CONVERGED, DIVERGED, PREPARED
@@ -42,14 +42,14 @@ def step_side_by_side(environments: Environments, rows: I64, n: int, status: I64
             end_step(environments, rows[k], status[k] == SETTLED)
 
 
-@jit
+@separate
 def _begin(environments: Environments, i: int) -> int:
     """Play the step of row ``i`` up to the power flow; the status of that, or ``_LOST``."""
     if begin_step(environments, i, True) and not dispatch_or_lose(environments, i):
         return _LOST
     set_scene(environments, i)
     begin_cascade(environments, i)
-    return prepare(environments, i)
+    return int(prepare(environments, i))
 
 
 @jit
@@ -66,21 +66,36 @@ def _find_all_flows(environments: Environments, rows: I64, n: int, status: I64) 
 @jit
 def _find_flows(environments: Environments, rows: I64, n: int, status: I64, first: int) -> None:
     """Solve the flow of row ``first``, together with those of later rows that can be solved beside it."""
-    network, flow, lanes = environments.network, environments.flow, environments.lanes
-    gen_v, a_or = environments.hidden.gen_v, environments.state.a_or
-    if may_go_on(flow, rows[first]):
+    if may_go_on(environments.flow, rows[first]):
         n_lanes = _gather_warm(environments, rows, n, status, first)
         if n_lanes >= _FEWEST_WARM:
-            solve_warm_side_by_side(network, flow, lanes, n_lanes, gen_v, a_or)
+            _solve_warm(environments, n_lanes)
             _take_over(environments, n_lanes, status)
             return
-    elif flow.known[rows[first]]:
+    elif environments.flow.known[rows[first]]:
         n_lanes = _gather_cold(environments, rows, n, status, first)
         if n_lanes >= _FEWEST_COLD:
-            solve_cold_side_by_side(network, flow, lanes, environments.union, n_lanes, gen_v, a_or)
+            _solve_cold(environments, n_lanes)
             _take_over(environments, n_lanes, status)
             return
     status[first] = find_flow(environments, rows[first])
+
+
+@separate
+def _solve_warm(environments: Environments, n_lanes: int) -> int:
+    """Solve the flows of so many lanes, which go on."""
+    state, hidden, lanes = environments.state, environments.hidden, environments.lanes
+    solve_warm_side_by_side(environments.network, environments.flow, lanes, n_lanes, hidden.gen_v, state.a_or)
+    return n_lanes
+
+
+@separate
+def _solve_cold(environments: Environments, n_lanes: int) -> int:
+    """Solve the flows of so many lanes, which begin anew."""
+    network, flow, lanes = environments.network, environments.flow, environments.lanes
+    gen_v, a_or = environments.hidden.gen_v, environments.state.a_or
+    solve_cold_side_by_side(network, flow, lanes, environments.union, n_lanes, gen_v, a_or)
+    return n_lanes
 
 
 @jit

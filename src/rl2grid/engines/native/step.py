@@ -8,7 +8,7 @@
 from __future__ import annotations
 
 from rl2grid.compile import jit
-from rl2grid.engines.native.environments import Environments
+from rl2grid.engines.native.environments import Environments, separate
 from rl2grid.engines.native.generation import (
     begin_generation,
     curtail,
@@ -36,9 +36,9 @@ from rl2grid.structures import blank_row
 _DISPATCH = int(GameOver.DISPATCH)
 
 
-@jit
-def reset_row(environments: Environments, i: int) -> None:
-    """Show the first row of the series of environment ``i``.
+@separate
+def reset_row(environments: Environments, i: int) -> int:
+    """Show the first row of the series of environment ``i``; 1 if it has a power flow, else 0.
 
     Grid2Op plays a step for that: nobody acts, overloads are not counted, but lines above the hard limit trip.
     """
@@ -60,10 +60,11 @@ def reset_row(environments: Environments, i: int) -> None:
     set_generators(environments, i)
     if not flow_with_cascade(environments, i, False):
         lose(state, i, game_over_by_flow(state, i))
-        return
+        return 0
     remember_busbars(environments, i)
     hidden.setpoint[i] = hidden.new_p[i] + state.actual_dispatch[i]
     observe(environments, i)
+    return 1
 
 
 @jit
