@@ -43,7 +43,10 @@ class Separate:
         llvmlite.binding.add_symbol(self.name, ctypes.addressof(self._word))
 
     def ready(self) -> None:
-        """Compile the function, or load its code, if that has not been done."""
+        """Compile the function, or load its code, if that has not been done.
+
+        Compiled callers may do without, but what compiles within their call cannot be interrupted.
+        """
         if self._is_ready:
             return
         self._compiled.compile(self.signature)
@@ -61,7 +64,7 @@ def separate_jit(kind: type[tuple[Any, ...]], separate: list[Separate]) -> Calla
 
     Args:
         kind: of the structure, which callers have opened.
-        separate: gets what makes the function :meth:`~Separate.ready`.
+        separate: the function is added to it.
     """
 
     def decorate(function: Compiled) -> Compiled:
@@ -84,6 +87,7 @@ def _caller(entry: Separate) -> Compiled:
             native = ir.FunctionType(
                 ir.IntType(32), [_WORD.as_pointer(), _ADDRESS.as_pointer(), _WORD, _WORD]
             ).as_pointer()
+            # Compiled functions raise nothing: what they found is in what they write.
             result = cgutils.alloca_once(builder, _WORD)
             exception = cgutils.alloca_once(builder, _ADDRESS)
             builder.call(builder.inttoptr(builder.load(word), native), [result, exception, *arguments])
