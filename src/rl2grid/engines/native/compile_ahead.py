@@ -50,7 +50,7 @@ def _compile() -> None:
     turn = take_turn(cache_directory())
     if turn is not None:
         advance.compile(SIGNATURE)  # type: ignore[attr-defined]
-        for function in SEPARATE:
+        for function in reversed(SEPARATE):  # the parent comes from the other end
             function.ready()
         turn.release()
 

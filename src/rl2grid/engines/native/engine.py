@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -79,8 +80,6 @@ class NativeEngine:
         self._playing: list[Playing | None] = [None] * n
         # Behind an imagined future: planners come back to it.
         self._true: list[Playing | None] = [None] * n
-        for function in SEPARATE:
-            function.ready()
         self._use(new_environments(grid, self.network, n, self.attacks))
         self._simulated = self._new_simulated()
         # Of threads that play transitions: a question from outside keeps its answer in the one above.
@@ -305,10 +304,11 @@ class NativeEngine:
     @property
     def address(self) -> int:
         """Where compiled code finds the environments, for one thread at a time; see :meth:`address_for`."""
-        return self._handles[0].address
+        return self.address_for(0)
 
     def address_for(self, thread: int) -> int:
         """The same environments with a workspace for thread ``thread``: threads may then play different rows."""
+        _make_ready()
         while len(self._handles) <= thread:
             flow = with_own_workspace(self.environments.flow)
             lanes = with_own_workspace(self.environments.lanes)
@@ -401,6 +401,13 @@ class NativeEngine:
             float(hidden.storage_change[i]) - float(hidden.curtailment_change[i]),
             state.actual_dispatch[i],
         )
+
+
+@functools.cache
+def _make_ready() -> None:
+    """Compile, or load, what compiled code calls by address: before it does, in a call that can be interrupted."""
+    for function in SEPARATE:
+        function.ready()
 
 
 def _rebuild(
