@@ -19,14 +19,22 @@ from rl2grid.compile import borrowing_jit
 from rl2grid.powerflow.ac import finish_cold, write_currents
 from rl2grid.powerflow.bits import count_bits
 from rl2grid.powerflow.factors import ONE, THREE, factorise, solve
-from rl2grid.powerflow.flow_lanes import LOST, FlowLanes, any_marked, give_up_singular, hold_still, take_new_factors
+from rl2grid.powerflow.flow_lanes import (
+    LOST,
+    FlowLanes,
+    any_marked,
+    forget_marks,
+    give_up_singular,
+    hold_still,
+    mark,
+    take_new_factors,
+)
 from rl2grid.powerflow.flow_state import ABSENT, Equations, Factors, FlowState
 from rl2grid.powerflow.lane_flow import DONE, FAILED, RUNNING
 from rl2grid.powerflow.lanes import WIDTH, Lanes, larger, load, magnitude, splat, store, where_less
 from rl2grid.powerflow.model import Network
 from rl2grid.powerflow.newton import (
     ARRIVED,
-    RENEW,
     STUCK,
     apply_step,
     fill_jacobian,
@@ -130,14 +138,8 @@ def solve_cold_side_by_side(
         n_free, union.first_unknown, union.admittance_first, union.admittance_node, union.admittance,
         union.admittance_panel, lanes.magnitude, lanes.angle, lanes.voltage, lanes.injection, lanes.power, lanes.step,
     )  # fmt: skip
-    factors = Factors(
-        n_free, union.first_unknown, union.node_of_unknown, union.first_column, union.own_column, union.first_panel,
-        union.own_panel, union.column, lanes.panel, lanes.sparse_row,
-    )  # fmt: skip
-    new_factors = Factors(
-        n_free, union.first_unknown, union.node_of_unknown, union.first_column, union.own_column, union.first_panel,
-        union.own_panel, union.column, lanes.new_panel, lanes.sparse_row,
-    )  # fmt: skip
+    factors = _factors_of(union, n_free, lanes, lanes.panel)
+    new_factors = _factors_of(union, n_free, lanes, lanes.new_panel)
     n_values = np.int64(union.first_panel[n_free])
     _begin(flow, lanes, union, n, n_free, gen_v)
     _fill_dc(network, flow, lanes, union, n, n_free)
@@ -169,6 +171,23 @@ def solve_cold_side_by_side(
     for lane in range(n):
         if lanes.state[lane] == DONE:
             write_currents(network, flow, lanes.row[lane], a_or[lanes.row[lane]])
+
+
+@borrowing_jit
+def _factors_of(union: Union, n_free: np.int64, lanes: FlowLanes, panel: Lanes) -> Factors:
+    """Factors with the values ``panel`` and the topology of the union."""
+    return Factors(
+        n_free,
+        union.first_unknown,
+        union.node_of_unknown,
+        union.first_column,
+        union.own_column,
+        union.first_panel,
+        union.own_panel,
+        union.column,
+        panel,
+        lanes.sparse_row,
+    )
 
 
 @borrowing_jit
@@ -410,9 +429,7 @@ def _judge(
 ) -> int:
     """Decide which lanes take another step, and which of them with new factors, and end the others; how many do."""
     n_active = 0
-    for lane in range(WIDTH):
-        lanes.active[0, lane] = 0.0
-        lanes.renews[0, lane] = 0.0
+    forget_marks(lanes)
     for lane in range(n):
         if lanes.state[lane] != RUNNING:
             continue
@@ -421,8 +438,7 @@ def _judge(
         if verdict in (ARRIVED, STUCK):
             _finish(network, flow, lanes, union, panel, lane, n_steps)
         else:
-            lanes.active[0, lane] = 1.0
-            lanes.renews[0, lane] = 1.0 if verdict == RENEW else 0.0
+            mark(lanes, lane, verdict)
             n_active += 1
     if n_active > _FEW:
         return n_active

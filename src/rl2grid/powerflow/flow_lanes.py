@@ -9,6 +9,7 @@ from rl2grid.compile import borrowing_jit
 from rl2grid.powerflow.flow_state import Equations, FlowState
 from rl2grid.powerflow.lane_flow import EMPTY, FAILED
 from rl2grid.powerflow.lanes import WIDTH, Lanes, load, splat, store, where_less
+from rl2grid.powerflow.newton import RENEW
 from rl2grid.structures import allocate, workspace
 
 LOST = EMPTY + 1
@@ -58,6 +59,20 @@ def any_marked(marks: Lanes, n: Index) -> bool:
     for lane in range(n):
         marked |= marks[0, lane] > 0.0
     return marked
+
+
+@borrowing_jit
+def forget_marks(lanes: FlowLanes) -> None:
+    """Let no lane take a step."""
+    store(lanes.active, 0, splat(0.0))
+    store(lanes.renews, 0, splat(0.0))
+
+
+@borrowing_jit
+def mark(lanes: FlowLanes, lane: Index, verdict: int) -> None:
+    """Let a lane take a step, with new factors if the verdict is RENEW."""
+    lanes.active[0, lane] = 1.0
+    lanes.renews[0, lane] = 1.0 if verdict == RENEW else 0.0
 
 
 @borrowing_jit

@@ -13,14 +13,21 @@ from rl2grid.arrays import F32, F64, Index
 from rl2grid.compile import borrowing_jit
 from rl2grid.powerflow.ac import amperes, line_current
 from rl2grid.powerflow.factors import ONE, TWO, factorise, solve
-from rl2grid.powerflow.flow_lanes import FlowLanes, any_marked, give_up_singular, hold_still, take_new_factors
+from rl2grid.powerflow.flow_lanes import (
+    FlowLanes,
+    any_marked,
+    forget_marks,
+    give_up_singular,
+    hold_still,
+    mark,
+    take_new_factors,
+)
 from rl2grid.powerflow.flow_state import ABSENT, Equations, Factors, FlowState
 from rl2grid.powerflow.lane_flow import DONE, FAILED, RUNNING
-from rl2grid.powerflow.lanes import WIDTH, load, load_columns, splat, store, store_columns
+from rl2grid.powerflow.lanes import WIDTH, Lanes, load, load_columns, splat, store, store_columns
 from rl2grid.powerflow.model import Network
 from rl2grid.powerflow.newton import (
     ARRIVED,
-    RENEW,
     STUCK,
     apply_step,
     fill_jacobian,
@@ -53,14 +60,8 @@ def solve_warm_side_by_side(
         n_free, flow.first_unknown[i], flow.admittance_first[i], flow.admittance_node[i], flow.admittance[i],
         flow.admittance_panel[i], lanes.magnitude, lanes.angle, lanes.voltage, lanes.injection, lanes.power, lanes.step,
     )  # fmt: skip
-    factors = Factors(
-        n_free, flow.first_unknown[i], flow.node_of_unknown[i], flow.first_column[i], flow.own_column[i],
-        flow.first_panel[i], flow.own_panel[i], flow.column[i], lanes.panel, lanes.sparse_row,
-    )  # fmt: skip
-    new_factors = Factors(
-        n_free, flow.first_unknown[i], flow.node_of_unknown[i], flow.first_column[i], flow.own_column[i],
-        flow.first_panel[i], flow.own_panel[i], flow.column[i], lanes.new_panel, lanes.sparse_row,
-    )  # fmt: skip
+    factors = _factors_of(flow, i, lanes, lanes.panel)
+    new_factors = _factors_of(flow, i, lanes, lanes.new_panel)
     n_values = np.int64(flow.first_panel[i, n_free])
     for lane in range(WIDTH):
         lanes.state[lane] = FAILED
@@ -87,6 +88,23 @@ def solve_warm_side_by_side(
         if lanes.state[lane] == DONE:
             _finish(flow, lanes, lane, a_or[lanes.row[lane]])
     _scatter_factors(flow, lanes, n, n_values)
+
+
+@borrowing_jit
+def _factors_of(flow: FlowState, i: Index, lanes: FlowLanes, panel: Lanes) -> Factors:
+    """Factors with the values ``panel`` and the topology of row ``i``."""
+    return Factors(
+        np.int64(flow.n_node[i]) - 1,
+        flow.first_unknown[i],
+        flow.node_of_unknown[i],
+        flow.first_column[i],
+        flow.own_column[i],
+        flow.first_panel[i],
+        flow.own_panel[i],
+        flow.column[i],
+        panel,
+        lanes.sparse_row,
+    )
 
 
 @borrowing_jit
@@ -138,9 +156,7 @@ def _scatter_factors(flow: FlowState, lanes: FlowLanes, n: Index, n_values: Inde
 @borrowing_jit
 def _judge(lanes: FlowLanes, n: Index, n_steps: int, tolerance: float) -> bool:
     """Decide which lanes take another step, and which of them with new factors; whether any does."""
-    for lane in range(WIDTH):
-        lanes.active[0, lane] = 0.0
-        lanes.renews[0, lane] = 0.0
+    forget_marks(lanes)
     for lane in range(n):
         if lanes.state[lane] != RUNNING:
             continue
@@ -152,8 +168,7 @@ def _judge(lanes: FlowLanes, n: Index, n_steps: int, tolerance: float) -> bool:
         elif verdict == STUCK:
             lanes.state[lane] = FAILED
         else:
-            lanes.active[0, lane] = 1.0
-            lanes.renews[0, lane] = 1.0 if verdict == RENEW else 0.0
+            mark(lanes, lane, verdict)
     return any_marked(lanes.active, n)
 
 
