@@ -302,7 +302,8 @@ def test_a_worker_that_dies_is_noticed():
         play(workers=1, exit_on="may")
 
 
-def test_bad_requests_are_refused_in_one_sentence(tmp_path):
+def test_bad_requests_are_refused_in_one_sentence_before_months_are_made(tmp_path, monkeypatch):
+    monkeypatch.setattr(evaluation, "make_scenarios", lambda *request: pytest.fail("months are made"))
     bad = {
         "choose one of do-nothing, random, recovery": {"agent": "ppoo"},
         "Task 'bus15-T0' does not exist": {"task": "bus15-T0"},

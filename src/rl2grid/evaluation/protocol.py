@@ -97,6 +97,7 @@ def evaluate(
     chosen_scenarios = _checked_scenarios(task, split, scenarios)
     jobs = _jobs(chosen_scenarios, seeds, start)
     _check_lengths(task, chosen_scenarios, start, keywords.get("episode_length"))
+    processes = _number_of_workers(workers, TaskOptions(**keywords).engine, agent, len(jobs))
     if output is not None:
         check_folder(output)  # before months are made, which takes minutes
     watch_making(task.grid_id, *make_scenarios(task.grid_id, chosen_scenarios), progress)
@@ -106,7 +107,7 @@ def evaluate(
         jobs,
         identity=_identity(task, chosen, printable(name or chosen.name), keywords, start, chosen_scenarios),
         command=command or _call(agent, task, keywords, scenarios, seeds, start, name),
-        workers=_number_of_workers(workers, TaskOptions(**keywords).engine, agent, len(jobs)),
+        workers=processes,
         output=output,
         progress=progress,
     )
