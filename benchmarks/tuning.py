@@ -1,7 +1,8 @@
 """Hyperparameters of PPO, DQN and SAC searched for with equal effort, and what was found beside the defaults.
 
-``python benchmarks/tuning.py search [ALGORITHM ...] --folder F`` searches, as ``rl2grid study tune`` does, each
-algorithm with the same number of trials, seeds and decisions, on the first 20 validation months. ``... compare
+``python benchmarks/tuning.py search [SEARCH ...] --folder F`` searches, as ``rl2grid study tune`` does, each
+algorithm with the same number of trials, seeds and decisions, on the first 20 validation months: ``ppo``, ``dqn`` and
+``sac`` the hyperparameters, ``ppo-rewards`` and the like the weights of the reward, with the discount. ``... compare
 --folder F`` trains the defaults, the defaults with falling learning rates and what was found, with seeds that the
 search did not use, and plays the policies on the 180 validation months behind these. Both go on after an interruption
 and write ``benchmarks/results/tuning.json``. Test months are never played.
@@ -13,6 +14,7 @@ import argparse
 import json
 import os
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +24,11 @@ from gains import CHOSEN_ON, compared, survival_behind
 from rich.console import Console
 
 import rl2grid
+from rl2grid.mdp.rewards import PRESETS
 from rl2grid.records.files import write_json
 from rl2grid.records.searches import JOURNAL_FILE
 from rl2grid.studies.search import run_tuning
-from rl2grid.studies.tuning import parse_tuning
+from rl2grid.studies.tuning import WEIGHT_CHOICES, WEIGHTS, parse_tuning
 from rl2grid.training.runs import resume
 
 RESULTS = Path(__file__).resolve().parent / "results" / "tuning.json"
@@ -75,6 +78,8 @@ SPACES: dict[str, dict[str, Any]] = {
     },
 }
 """What is searched: as many hyperparameters of each."""
+REWARDS: dict[str, Any] = {"gamma": _OFF_POLICY["gamma"], **{name: list(WEIGHT_CHOICES[name]) for name in WEIGHTS}}
+"""What is searched of the reward: the paper's weights, and the discount, without which they mean little."""
 FIXED: dict[str, dict[str, Any]] = {
     "ppo": {},
     "dqn": {"last_learning_rate_share": 0.05},
@@ -85,20 +90,39 @@ SEEDS = (11, 12, 13)
 """Of the trainings that are compared."""
 
 
-def search(algorithm: str, folder: Path) -> dict[str, Any] | None:
+@dataclass(frozen=True)
+class Search:
+    """One search: of an algorithm, in a space."""
+
+    algorithm: str
+    space: Mapping[str, Any]
+
+    @property
+    def fixed(self) -> dict[str, Any]:
+        """The same in all trials."""
+        return FIXED[self.algorithm]
+
+
+SEARCHES = {name: Search(name, space) for name, space in SPACES.items()} | {
+    f"{name}-rewards": Search(name, REWARDS) for name in SPACES
+}
+
+
+def search(name: str, folder: Path) -> dict[str, Any] | None:
     """What was found, what was spent, and every trial; None when interrupted."""
+    asked = SEARCHES[name]
     contents = {
-        "name": f"{algorithm}-bus14",
-        "algorithm": algorithm,
-        "hyperparameters": FIXED[algorithm],
-        "space": SPACES[algorithm],
+        "name": f"{name}-bus14",
+        "algorithm": asked.algorithm,
+        "hyperparameters": asked.fixed,
+        "space": asked.space,
         **EFFORT,
     }
-    tuning = parse_tuning(contents, folder / algorithm)
+    tuning = parse_tuning(contents, folder / name)
     if run_tuning(tuning, jobs=1, console=Console(stderr=True)) is None:
         return None
     found: dict[str, Any] = json.loads((tuning.output / "best.json").read_text())
-    return {**found, "space": SPACES[algorithm], "trials": _trials(tuning.output)}
+    return {**found, "space": asked.space, "trials": _trials(tuning.output)}
 
 
 def _trials(folder: Path) -> list[dict[str, Any]]:
@@ -117,66 +141,73 @@ def _trials(folder: Path) -> list[dict[str, Any]]:
     ]
 
 
-def variants(algorithm: str, found: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
-    """What is compared, as changes of the preset ``default``."""
-    falling = {"falling": FIXED[algorithm]} if FIXED[algorithm] else {}
-    return {"default": {}, **falling, "found": {**FIXED[algorithm], **found["hyperparameters"]}}
+def variants(name: str, found: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    """What is compared, as changes of the preset ``default``, weights of the reward among them."""
+    fixed = SEARCHES[name].fixed
+    falling = {"falling": fixed} if fixed else {}
+    return {"default": {}, **falling, "found": {**fixed, **found["hyperparameters"]}}
 
 
-def survival(algorithm: str, variant: str, changes: Mapping[str, Any], seed: int, folder: Path) -> list[float]:
+def survival(name: str, variant: str, changes: Mapping[str, Any], seed: int, folder: Path) -> list[float]:
     """Train, or go on, and play the best policy: survival of each of the months that no trial was chosen by."""
-    run = folder / f"{algorithm}-{variant}-{seed}"
+    run = folder / f"{name}-{variant}-{seed}"
     if run.exists():
         resume(run)
     else:
+        usual = dict(zip(WEIGHTS, PRESETS["default"].weights, strict=True))
         rl2grid.train(
-            algorithm,
+            SEARCHES[name].algorithm,
             EFFORT["task"],
             folder=run,
-            hyperparameters={"total_timesteps": EFFORT["budget"], "seed": seed, **changes},
+            hyperparameters={
+                "total_timesteps": EFFORT["budget"],
+                "seed": seed,
+                **{key: value for key, value in changes.items() if key not in WEIGHTS},
+            },
             validation_months=CHOSEN_ON,
             evaluate_every=EFFORT["budget"] // EFFORT["validations"],
             heuristic=EFFORT["heuristic"],
+            reward=tuple(float(changes.get(weight, usual[weight])) for weight in WEIGHTS),
         )
     return survival_behind(run, EFFORT["task"])
 
 
-def compare(algorithm: str, found: dict[str, Any], folder: Path, keep: Callable[[], None]) -> None:
+def compare(name: str, found: dict[str, Any], folder: Path, keep: Callable[[], None]) -> None:
     """Train and play what is not there yet, and compare."""
-    all_variants = variants(algorithm, found)
+    all_variants = variants(name, found)
     played = found.setdefault("played", {})
     for seed in SEEDS:
         for variant, changes in all_variants.items():
             months_of = played.setdefault(variant, {})
             if f"seed {seed}" not in months_of:
-                months_of[f"seed {seed}"] = survival(algorithm, variant, changes, seed, folder)
+                months_of[f"seed {seed}"] = survival(name, variant, changes, seed, folder)
                 keep()
-    found["compared"] = compared({name: list(runs.values()) for name, runs in played.items()}, "default")
+    found["compared"] = compared({variant: list(runs.values()) for variant, runs in played.items()}, "default")
     keep()
-    print(algorithm, json.dumps(found["compared"]))
+    print(name, json.dumps(found["compared"]))
 
 
 def main() -> None:
     """Search, or compare, what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("search", "compare"))
-    parser.add_argument("algorithms", nargs="*", metavar="ALGORITHM", help=f"of {', '.join(SPACES)}; default: all")
+    parser.add_argument("searches", nargs="*", metavar="SEARCH", help=f"of {', '.join(SEARCHES)}; default: all")
     parser.add_argument("--folder", type=Path, default=Path("tuning"), help="where trainings are kept")
     arguments = parser.parse_args()
     results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {"effort": EFFORT, "algorithms": {}}
-    for algorithm in arguments.algorithms or SPACES:
-        if algorithm not in SPACES:
-            parser.error(f"Algorithm {algorithm!r} is not searched: choose among {', '.join(SPACES)}.")
+    for name in arguments.searches or SEARCHES:
+        if name not in SEARCHES:
+            parser.error(f"There is no search {name!r}: choose among {', '.join(SEARCHES)}.")
         if arguments.what == "search":
-            found = search(algorithm, arguments.folder)
+            found = search(name, arguments.folder)
             if found is None:
                 return
-            results["algorithms"][algorithm] = found
+            results["algorithms"][name] = found
             write_json(RESULTS, results, indent=1)
-            print(algorithm, found["survival"], found["command"])
+            print(name, found["survival"], found["command"])
         else:
-            found = results["algorithms"][algorithm]
-            compare(algorithm, found, arguments.folder, lambda: write_json(RESULTS, results, indent=1))
+            found = results["algorithms"][name]
+            compare(name, found, arguments.folder, lambda: write_json(RESULTS, results, indent=1))
 
 
 if __name__ == "__main__":
