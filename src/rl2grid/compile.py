@@ -19,6 +19,7 @@ from numba.core.types.misc import unliteral
 
 from rl2grid import compile_notices
 from rl2grid.compiled_files import keep_code_of
+from rl2grid.compiled_parts import Pipeline, part_for_compiled_callers
 
 compile_notices.install()
 
@@ -61,8 +62,9 @@ def jit(function: Function) -> Function:
     Division by zero follows NumPy, and floating point stays strict: results do not depend on how
     a loop is vectorised.
     """
-    compiled: Function = numba.njit(error_model="numpy", nogil=True)(function)
+    compiled: Function = numba.njit(error_model="numpy", nogil=True, pipeline_class=Pipeline)(function)
     keep_code_of(compiled, cache_directory())
+    part_for_compiled_callers(compiled)
     _take_literals_as_numbers(compiled)
     return compiled
 
