@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -31,6 +32,18 @@ def test_results_come_back_by_their_configuration(tmp_path: Path):
     kept = hashed_test(CONFIGURATION, {}, result("greedy", [[0.5], [1.0]]))
     add_test(path, kept)
     assert read_ledger(path) == {identity_hash(CONFIGURATION): kept}
+
+
+def test_results_that_are_added_at_once_are_all_kept(tmp_path: Path):
+    path = tmp_path / "ledger.json"
+    configurations = [{**CONFIGURATION, "task": f"rl2grid/bus14-T{level}-v0"} for level in range(12)]
+    with ThreadPoolExecutor(len(configurations)) as threads:
+        list(
+            threads.map(
+                lambda one: add_test(path, hashed_test(one, {}, result("greedy", [[0.5], [1.0]]))), configurations
+            )
+        )
+    assert set(read_ledger(path)) == {identity_hash(one) for one in configurations}
 
 
 def test_the_ledger_of_the_baselines_keeps_its_bytes(tmp_path: Path):

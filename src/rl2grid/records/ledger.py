@@ -16,6 +16,7 @@ from typing import Any
 
 from rl2grid.records.evaluations import Evaluation, identity_hash
 from rl2grid.records.files import CHECKSUM, checksum, misfit, not_what, read_json, write_json
+from rl2grid.records.locks import locked
 from rl2grid.records.month_values import pack_months
 
 _REMEDY = "give a file that 'rl2grid leaderboard test' wrote, or one that does not exist yet"
@@ -196,6 +197,7 @@ def _stored(result: HashedTest) -> dict[str, Any]:
 
 
 def add_test(path: Path, result: HashedTest) -> None:
-    """Add a result to a ledger, or replace that of its configuration."""
-    results = {**read_ledger(path), identity_hash(result.configuration): result}
-    write_json(path, {digest: _stored(one) for digest, one in results.items()}, indent=1)
+    """Add a result to a ledger, or replace that of its configuration; processes that do so at once lose nothing."""
+    with locked(path.parent, f".{path.name}.lock", wait=True):
+        results = {**read_ledger(path), identity_hash(result.configuration): result}
+        write_json(path, {digest: _stored(one) for digest, one in results.items()}, indent=1)
