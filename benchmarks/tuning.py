@@ -24,11 +24,10 @@ from gains import CHOSEN_ON, compared, survival_behind
 from rich.console import Console
 
 import rl2grid
-from rl2grid.mdp.rewards import PRESETS
 from rl2grid.records.files import write_json
 from rl2grid.records.searches import JOURNAL_FILE
 from rl2grid.studies.search import run_tuning
-from rl2grid.studies.tuning import WEIGHT_CHOICES, WEIGHTS, parse_tuning
+from rl2grid.studies.tuning import WEIGHT_CHOICES, WEIGHTS, Tuning, parse_tuning
 from rl2grid.training.runs import resume
 
 RESULTS = Path(__file__).resolve().parent / "results" / "tuning.json"
@@ -78,7 +77,10 @@ SPACES: dict[str, dict[str, Any]] = {
     },
 }
 """What is searched: as many hyperparameters of each."""
-REWARDS: dict[str, Any] = {"gamma": _OFF_POLICY["gamma"], **{name: list(WEIGHT_CHOICES[name]) for name in WEIGHTS}}
+REWARDS: dict[str, Any] = {
+    "gamma": _OFF_POLICY["gamma"],
+    **{name: list(choices) for name, choices in WEIGHT_CHOICES.items()},
+}
 """What is searched of the reward: the paper's weights, and the discount, without which they mean little."""
 FIXED: dict[str, dict[str, Any]] = {
     "ppo": {},
@@ -110,19 +112,23 @@ SEARCHES = {name: Search(name, space) for name, space in SPACES.items()} | {
 
 def search(name: str, folder: Path) -> dict[str, Any] | None:
     """What was found, what was spent, and every trial; None when interrupted."""
-    asked = SEARCHES[name]
-    contents = {
-        "name": f"{name}-bus14",
-        "algorithm": asked.algorithm,
-        "hyperparameters": asked.fixed,
-        "space": asked.space,
-        **EFFORT,
-    }
-    tuning = parse_tuning(contents, folder / name)
+    tuning = _tuning(name, SEARCHES[name].fixed, folder)
     if run_tuning(tuning, jobs=1, console=Console(stderr=True)) is None:
         return None
     found: dict[str, Any] = json.loads((tuning.output / "best.json").read_text())
-    return {**found, "space": asked.space, "trials": _trials(tuning.output)}
+    return {**found, "space": SEARCHES[name].space, "trials": _trials(tuning.output)}
+
+
+def _tuning(name: str, fixed: Mapping[str, Any], folder: Path) -> Tuning:
+    """The search, with some hyperparameters fixed."""
+    contents = {
+        "name": f"{name}-bus14",
+        "algorithm": SEARCHES[name].algorithm,
+        "hyperparameters": fixed,
+        "space": SEARCHES[name].space,
+        **EFFORT,
+    }
+    return parse_tuning(contents, folder / name)
 
 
 def _trials(folder: Path) -> list[dict[str, Any]]:
@@ -154,7 +160,6 @@ def survival(name: str, variant: str, changes: Mapping[str, Any], seed: int, fol
     if run.exists():
         resume(run)
     else:
-        usual = dict(zip(WEIGHTS, PRESETS["default"].weights, strict=True))
         rl2grid.train(
             SEARCHES[name].algorithm,
             EFFORT["task"],
@@ -166,8 +171,7 @@ def survival(name: str, variant: str, changes: Mapping[str, Any], seed: int, fol
             },
             validation_months=CHOSEN_ON,
             evaluate_every=EFFORT["budget"] // EFFORT["validations"],
-            heuristic=EFFORT["heuristic"],
-            reward=tuple(float(changes.get(weight, usual[weight])) for weight in WEIGHTS),
+            **_tuning(name, {}, folder).environment(changes),
         )
     return survival_behind(run, EFFORT["task"])
 

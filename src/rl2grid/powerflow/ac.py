@@ -8,7 +8,7 @@ import numpy as np
 
 from rl2grid.arrays import F32, F64, I32, U16
 from rl2grid.compile import borrowing_jit, owning_jit
-from rl2grid.powerflow.flow_state import ABSENT, Equations, Factors, FlowState, forget_flow, new_flow_state
+from rl2grid.powerflow.flow_state import ABSENT, FlowState, equations_of, factors_of, forget_flow, new_flow_state
 from rl2grid.powerflow.lanes import root, where_less
 from rl2grid.powerflow.model import Network
 from rl2grid.powerflow.newton import go_on_cold, may_go_on, solve_cold, solve_warm
@@ -127,7 +127,7 @@ def solve_flow(network: Network, flow: FlowState, i: int, topo_vect: I32, gen_v:
 @borrowing_jit
 def _solve(network: Network, flow: FlowState, i: int, gen_v: F32 | F64, column: U16, panel: F64) -> bool:
     """Solve from the voltages of the last flow if that may be, else cold."""
-    equations, factors = _equations_of(flow, i), _factors_of(flow, i, column, panel)
+    equations, factors = equations_of(flow, i), factors_of(flow, i, column, panel, flow.sparse_row)
     if may_go_on(flow, i) and solve_warm(network, flow, i, gen_v, equations, factors):
         return True
     _write_start(flow, i, gen_v)
@@ -145,43 +145,9 @@ def finish_cold(network: Network, flow: FlowState, i: int, n_steps: int, ratio: 
         n_steps: Newton steps behind it.
         ratio: of the mismatch to the one before the last of them, infinite before the first.
     """
-    equations, factors = _equations_of(flow, i), _factors_of(flow, i, flow.column[i], flow.panel[i])
+    equations, factors = equations_of(flow, i), factors_of(flow, i, flow.column[i], flow.panel[i], flow.sparse_row)
     flow.warm[i] = go_on_cold(network, flow, i, equations, factors, n_steps, ratio)
     return bool(flow.warm[i])
-
-
-@borrowing_jit
-def _equations_of(flow: FlowState, i: int) -> Equations:
-    return Equations(
-        np.int64(flow.n_node[i]) - 1,
-        flow.first_unknown[i],
-        flow.admittance_first[i],
-        flow.admittance_node[i],
-        flow.admittance[i],
-        flow.admittance_panel[i],
-        flow.magnitude[i],
-        flow.angle[i],
-        flow.voltage[i],
-        flow.injection[i],
-        flow.power[i],
-        flow.step,
-    )
-
-
-@borrowing_jit
-def _factors_of(flow: FlowState, i: int, column: U16, panel: F64) -> Factors:
-    return Factors(
-        np.int64(flow.n_node[i]) - 1,
-        flow.first_unknown[i],
-        flow.node_of_unknown[i],
-        flow.first_column[i],
-        flow.own_column[i],
-        flow.first_panel[i],
-        flow.own_panel[i],
-        column,
-        panel,
-        flow.sparse_row,
-    )
 
 
 @owning_jit

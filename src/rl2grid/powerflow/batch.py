@@ -27,7 +27,7 @@ from rl2grid.powerflow.ac import (
     write_currents,
 )
 from rl2grid.powerflow.factors import factorise
-from rl2grid.powerflow.flow_state import ABSENT, Equations, Factors
+from rl2grid.powerflow.flow_state import ABSENT, Equations, Factors, equations_of, factors_of
 from rl2grid.powerflow.lane_flow import (
     DONE,
     EMPTY,
@@ -235,34 +235,8 @@ def solve_changes(address: int, order: I32) -> None:
         for k in range(order.shape[0]):
             _solve_alone(batch, order[k])
         return
-    n_free = np.int64(flow.n_node[_BASE]) - 1
-    first_unknown = flow.first_unknown[_BASE]
-    equations = Equations(
-        n_free,
-        first_unknown,
-        flow.admittance_first[_BASE],
-        flow.admittance_node[_BASE],
-        flow.admittance[_BASE],
-        flow.admittance_panel[_BASE],
-        flow.magnitude[_BASE],
-        flow.angle[_BASE],
-        flow.voltage[_BASE],
-        flow.injection[_BASE],
-        flow.power[_BASE],
-        flow.step,
-    )
-    factors = Factors(
-        n_free,
-        first_unknown,
-        flow.node_of_unknown[_BASE],
-        flow.first_column[_BASE],
-        flow.own_column[_BASE],
-        flow.first_panel[_BASE],
-        flow.own_panel[_BASE],
-        flow.column[_BASE],
-        flow.panel[_BASE],
-        flow.sparse_row,
-    )
+    equations = equations_of(flow, _BASE)
+    factors = factors_of(flow, _BASE, flow.column[_BASE], flow.panel[_BASE], flow.sparse_row)
     begin = 0
     n = order.shape[0]
     while begin < n:

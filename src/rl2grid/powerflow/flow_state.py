@@ -6,7 +6,7 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from rl2grid.arrays import F32, F64, I32, U16, U32, U64, Flags
+from rl2grid.arrays import F32, F64, I32, U16, U32, U64, Flags, Index
 from rl2grid.compile import borrowing_jit
 from rl2grid.powerflow.model import Network
 from rl2grid.powerflow.ordering import elimination_order, reference_fill
@@ -139,3 +139,47 @@ def forget_flow(flow: FlowState, i: int) -> None:
     """Make the next flow of row ``i`` start cold, as after a reset."""
     flow.known[i] = False
     flow.warm[i] = False
+
+
+@borrowing_jit
+def equations_of(flow: FlowState, i: Index) -> Equations:
+    """The equations of row ``i``, where they lie."""
+    return Equations(
+        np.int64(flow.n_node[i]) - 1,
+        flow.first_unknown[i],
+        flow.admittance_first[i],
+        flow.admittance_node[i],
+        flow.admittance[i],
+        flow.admittance_panel[i],
+        flow.magnitude[i],
+        flow.angle[i],
+        flow.voltage[i],
+        flow.injection[i],
+        flow.power[i],
+        flow.step,
+    )
+
+
+@borrowing_jit
+def factors_of(flow: FlowState, i: Index, column: U16, panel: F64, sparse_row: F64) -> Factors:
+    """Factors of the topology of row ``i``.
+
+    Args:
+        flow: rows of environments.
+        i: row.
+        column: columns of all panels, those of the row or of arrays of its own.
+        panel: values, of the row or of lanes.
+        sparse_row: workspace, likewise.
+    """
+    return Factors(
+        np.int64(flow.n_node[i]) - 1,
+        flow.first_unknown[i],
+        flow.node_of_unknown[i],
+        flow.first_column[i],
+        flow.own_column[i],
+        flow.first_panel[i],
+        flow.own_panel[i],
+        column,
+        panel,
+        sparse_row,
+    )

@@ -31,7 +31,7 @@ from rl2grid.powerflow.ac import (
 )
 from rl2grid.powerflow.bridges import find_bridges, find_cuts
 from rl2grid.powerflow.factors import factorise
-from rl2grid.powerflow.flow_state import ABSENT, Equations, Factors
+from rl2grid.powerflow.flow_state import ABSENT, Equations, equations_of, factors_of
 from rl2grid.powerflow.lane_factors import LaneFactors, new_lane_factors
 from rl2grid.powerflow.lane_flow import DONE, EMPTY, FAILED, RUNNING
 from rl2grid.powerflow.lanes import WIDTH
@@ -338,33 +338,8 @@ def solve_cases(address: int, injections: Injections, cases: Cases, found: RowFl
         for case in range(n):
             _solve_alone(sweep, injections, cases, found, case)
         return
-    first_unknown, n_free = flow.first_unknown[_BASE], np.int64(flow.n_node[_BASE]) - 1
-    equations = Equations(
-        n_free,
-        first_unknown,
-        flow.admittance_first[_BASE],
-        flow.admittance_node[_BASE],
-        flow.admittance[_BASE],
-        flow.admittance_panel[_BASE],
-        flow.magnitude[_BASE],
-        flow.angle[_BASE],
-        flow.voltage[_BASE],
-        flow.injection[_BASE],
-        flow.power[_BASE],
-        flow.step,
-    )
-    factors = Factors(
-        n_free,
-        first_unknown,
-        flow.node_of_unknown[_BASE],
-        flow.first_column[_BASE],
-        flow.own_column[_BASE],
-        flow.first_panel[_BASE],
-        flow.own_panel[_BASE],
-        flow.column[_BASE],
-        flow.panel[_BASE],
-        flow.sparse_row,
-    )
+    equations = equations_of(flow, _BASE)
+    factors = factors_of(flow, _BASE, flow.column[_BASE], flow.panel[_BASE], flow.sparse_row)
     with_outages = n > 0 and cases.line[0] != NO_LINE
     if with_outages:
         write_admittance(equations, lanes)

@@ -22,9 +22,9 @@ from rl2grid.powerflow.flow_lanes import (
     mark,
     take_new_factors,
 )
-from rl2grid.powerflow.flow_state import ABSENT, Equations, Factors, FlowState
+from rl2grid.powerflow.flow_state import ABSENT, Equations, FlowState, factors_of
 from rl2grid.powerflow.lane_flow import DONE, FAILED, RUNNING
-from rl2grid.powerflow.lanes import WIDTH, Lanes, load, load_columns, splat, store, store_columns
+from rl2grid.powerflow.lanes import WIDTH, load, load_columns, splat, store, store_columns
 from rl2grid.powerflow.model import Network
 from rl2grid.powerflow.newton import (
     ARRIVED,
@@ -60,8 +60,8 @@ def solve_warm_side_by_side(
         n_free, flow.first_unknown[i], flow.admittance_first[i], flow.admittance_node[i], flow.admittance[i],
         flow.admittance_panel[i], lanes.magnitude, lanes.angle, lanes.voltage, lanes.injection, lanes.power, lanes.step,
     )  # fmt: skip
-    factors = _factors_of(flow, i, lanes, lanes.panel)
-    new_factors = _factors_of(flow, i, lanes, lanes.new_panel)
+    factors = factors_of(flow, i, flow.column[i], lanes.panel, lanes.sparse_row)
+    new_factors = factors_of(flow, i, flow.column[i], lanes.new_panel, lanes.sparse_row)
     n_values = np.int64(flow.first_panel[i, n_free])
     for lane in range(WIDTH):
         lanes.state[lane] = FAILED
@@ -88,23 +88,6 @@ def solve_warm_side_by_side(
         if lanes.state[lane] == DONE:
             _finish(flow, lanes, lane, a_or[lanes.row[lane]])
     _scatter_factors(flow, lanes, n, n_values)
-
-
-@borrowing_jit
-def _factors_of(flow: FlowState, i: Index, lanes: FlowLanes, panel: Lanes) -> Factors:
-    """Factors with the values ``panel`` and the topology of row ``i``."""
-    return Factors(
-        np.int64(flow.n_node[i]) - 1,
-        flow.first_unknown[i],
-        flow.node_of_unknown[i],
-        flow.first_column[i],
-        flow.own_column[i],
-        flow.first_panel[i],
-        flow.own_panel[i],
-        flow.column[i],
-        panel,
-        lanes.sparse_row,
-    )
 
 
 @borrowing_jit
