@@ -23,12 +23,13 @@ os.environ["OPENBLAS_NUM_THREADS"] = "1"
 from gains import CHOSEN_ON, compared, survival_behind
 from rich.console import Console
 
-import rl2grid
 from rl2grid.records.files import write_json
 from rl2grid.records.searches import JOURNAL_FILE
 from rl2grid.studies.search import run_tuning
-from rl2grid.studies.tuning import WEIGHT_CHOICES, WEIGHTS, Tuning, parse_tuning
-from rl2grid.training.runs import resume
+from rl2grid.studies.tuning import WEIGHT_CHOICES, Tuning, parse_tuning, run_args
+from rl2grid.training.request import read_config
+from rl2grid.training.runs import resume, train
+from rl2grid.training.validation import find_validator
 
 RESULTS = Path(__file__).resolve().parent / "results" / "tuning.json"
 EFFORT: dict[str, Any] = {
@@ -158,21 +159,10 @@ def survival(name: str, variant: str, changes: Mapping[str, Any], seed: int, fol
     """Train, or go on, and play the best policy: survival of each of the months that no trial was chosen by."""
     run = folder / f"{name}-{variant}-{seed}"
     if run.exists():
-        resume(run)
+        resume(run, evaluate=find_validator(read_config(run)[0]))
     else:
-        rl2grid.train(
-            SEARCHES[name].algorithm,
-            EFFORT["task"],
-            folder=run,
-            hyperparameters={
-                "total_timesteps": EFFORT["budget"],
-                "seed": seed,
-                **{key: value for key, value in changes.items() if key not in WEIGHTS},
-            },
-            validation_months=CHOSEN_ON,
-            evaluate_every=EFFORT["budget"] // EFFORT["validations"],
-            **_tuning(name, {}, folder).environment(changes),
-        )
+        args = run_args(_tuning(name, {}, folder), changes, run, seed)
+        train(args, evaluate=find_validator(args))
     return survival_behind(run, EFFORT["task"])
 
 
