@@ -193,7 +193,7 @@ def test_expanded_months_give_way_where_little_is_free(made, monkeypatch) -> Non
 
 def test_months_to_remove_are_looked_for_when_some_were_expanded_not_at_every_episode(made, monkeypatch) -> None:
     looked: list[int] = []
-    monkeypatch.setattr(generated, "_remove_oldest", lambda paths, limit: looked.append(len(paths)))
+    monkeypatch.setattr(generated, "_keep_latest", lambda paths, limit: looked.append(len(paths)))
     monkeypatch.setattr(generated, "_EXPANDED_MONTHS", itertools.count())
     monkeypatch.setattr(generated, "MONTHS_BETWEEN_CLEANUPS", 2)
     for month in (3, 4, 3, 3, 5, 3):

@@ -86,11 +86,17 @@ def test_the_library_is_made_beside_and_its_makers_end_with_the_process(monkeypa
     assert training_year(BUS14, TRAINING_SEEDS[1]).content_hash == hash_here
 
 
-def test_nothing_is_made_beside_where_nobody_shall_or_all_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_is_made_beside_where_nobody_shall_or_all_is_there_or_has_no_room(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(making, "_Maker", None)
     make_library_beside(BUS14)  # no makers in tests
     monkeypatch.setenv(MAKERS, "3")
     monkeypatch.setattr(making, "is_stored", lambda grid, seed, month: True)
+    making._make_beside.cache_clear()
+    make_library_beside(BUS14)
+    monkeypatch.setattr(making, "is_stored", lambda grid, seed, month: False)
+    monkeypatch.setattr(training_years, "free_bytes", lambda: 10**9)  # less than the library and what is left to others
     making._make_beside.cache_clear()
     make_library_beside(BUS14)
     monkeypatch.setenv(MAKERS, "many")

@@ -1,5 +1,6 @@
 """The library of training years: where its months lie, what they are, and how episodes are drawn from it."""
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from rl2grid.errors import UsageError
 from rl2grid.grids import load_grid
 from rl2grid.scenarios import training_years
-from rl2grid.scenarios.cache import data_folder
+from rl2grid.scenarios.cache import data_folder, series_folder
 from rl2grid.scenarios.episodes import EpisodePlan, plan_episode, planned_outages
 from rl2grid.scenarios.generator import month as generator
 from rl2grid.scenarios.generator.calendar import MONTH_STEPS
@@ -22,7 +23,14 @@ from rl2grid.scenarios.splits import (
     draw_training_months,
     years_for,
 )
-from rl2grid.scenarios.training_years import TrainingMonths, is_year_there, training_months, training_year
+from rl2grid.scenarios.training_years import (
+    TrainingMonths,
+    check_library_room,
+    has_library_room,
+    is_year_there,
+    training_months,
+    training_year,
+)
 
 BUS14 = load_grid("bus14")
 SEED = FIRST_TRAINING_SEED
@@ -72,12 +80,42 @@ def test_a_year_is_made_once_and_kept_as_integers(tmp_path: Path, monkeypatch) -
     assert made == [SEED + 1] * 2
 
 
-def test_a_library_that_does_not_fit_is_refused_before_anything_is_written(tmp_path: Path, monkeypatch) -> None:
+def test_a_library_that_does_not_fit_is_refused_and_a_year_that_fits_is_played(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setenv("RL2GRID_DATA", str(tmp_path))
     monkeypatch.setattr(training_years, "free_bytes", lambda: 5 * 10**8)
     with pytest.raises(UsageError, match=r"bus14 takes 0\.5 GB in .* and 0\.5 GB are free: free some"):
+        check_library_room(BUS14)
+    check_library_room(BUS14, 90)
+    assert not has_library_room(BUS14)
+    assert not list(tmp_path.rglob("*.npy"))
+    training_year(BUS14, SEED)
+    assert is_year_there(BUS14, SEED)
+
+
+def test_a_year_that_does_not_fit_is_refused_before_anything_is_written(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setenv("RL2GRID_DATA", str(tmp_path))
+    monkeypatch.setattr(training_years, "free_bytes", lambda: 10**6)
+    with pytest.raises(UsageError, match=r"bus14 takes 5 MB in .*, and 1 MB are free: free some"):
         training_year(BUS14, SEED)
     assert not list(tmp_path.rglob("*.npy"))
+
+
+def test_years_of_another_generator_give_way_to_those_that_are_played(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setenv("RL2GRID_DATA", str(tmp_path))
+    free = 10**6
+    training_year(BUS14, SEED)
+    current = next(series_folder("bus14").glob("year.*.npy"))
+    for age, name in enumerate(("oldest", "older", "latest")):
+        stale = current.with_name(f"year.{SEED}-{name}.npy")
+        stale.write_bytes(bytes(3 * 10**6))
+        os.utime(stale, (1000 + age, 1000 + age))
+
+    def left() -> list[str]:
+        return sorted(path.stem.partition("-")[2] for path in current.parent.glob("year.*.npy"))
+
+    monkeypatch.setattr(training_years, "free_bytes", lambda: free + 3 * 10**6 * (4 - len(left())))
+    training_year(BUS14, SEED + 1)
+    assert left() == sorted(["latest", *2 * [current.stem.partition("-")[2]]])
 
 
 def test_an_unwritable_data_folder_is_named(tmp_path: Path, monkeypatch) -> None:

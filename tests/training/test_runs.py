@@ -149,6 +149,15 @@ def test_a_folder_that_exists_is_not_written(tmp_path: Path):
     assert (folder / "checkpoint.pt").read_bytes() == before
 
 
+def test_a_training_whose_months_have_no_room_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("RL2GRID_DATA", str(tmp_path / "data"))
+    monkeypatch.setattr("rl2grid.scenarios.training_years.free_bytes", lambda: 10**8)
+    asked = RunArgs("bus14-T0", hyperparameters("ppo", "bus14-T0"), folder=tmp_path / "run")
+    with pytest.raises(UsageError, match=r"bus14 takes 0\.5 GB in .*, and 0\.1 GB are free: free some"):
+        train(asked)
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_folder_without_a_run_is_not_resumed(tmp_path: Path):
     with pytest.raises(UsageError, match=r"no config\.json"):
         resume(tmp_path, make_envs=toy_envs)

@@ -265,7 +265,7 @@ def test_the_public_function_returns_the_folder(tmp_path: Path):
 def test_a_library_without_room_is_refused_before_anything_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("RL2GRID_DATA", str(tmp_path / "data"))
     (tmp_path / "data").mkdir()
-    monkeypatch.setattr("rl2grid.scenarios.training_years.free_bytes", lambda: 10**8)
+    monkeypatch.setattr("rl2grid.scenarios.training_years.free_bytes", lambda: 10**6)
     with pytest.raises(UsageError, match="are free: free some"):
         rl2grid.teach("greedy", "bus14-T0", months=1, output=tmp_path / "labels")
     assert not (tmp_path / "labels").exists()

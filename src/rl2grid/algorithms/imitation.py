@@ -651,4 +651,14 @@ def load_policy(state: Mapping[str, Any]) -> ActorCritic | GaussianActor | Categ
     return sac.load_policy(state) if state["policy"] == SOFT else on_policy.load_policy(state)
 
 
-ALGORITHM = Algorithm("imitation", Args, Imitation, ("T", "R"), preset, load_policy, SEARCH_SPACE, joint_as_box=True)
+ALGORITHM = Algorithm(
+    "imitation",
+    Args,
+    Imitation,
+    ("T", "R"),
+    preset,
+    load_policy,
+    SEARCH_SPACE,
+    joint_as_box=True,
+    plays_months=False,
+)

@@ -79,6 +79,8 @@ class Algorithm:
     of a safe episode may reach, by constraint; None: the task's constraint is all there is."""
     joint_as_box: bool = False
     """Whether joint tasks are learned with continuous actions although discrete ones could be learned, too."""
+    plays_months: bool = True
+    """Whether it learns from months that it plays, which need room on the disk, and not from labels alone."""
 
     def learns(self, kind: str) -> bool:
         """Whether it can learn tasks of a kind, of :data:`rl2grid.mdp.features.KINDS`."""

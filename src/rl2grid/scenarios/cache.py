@@ -23,11 +23,11 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import platformdirs
@@ -38,6 +38,8 @@ from rl2grid.scenarios.folder import FolderContent
 
 FORMAT_VERSION = 1
 """Raised whenever the files below a version's folder would be read differently."""
+LEFT_FREE_BYTES = 2**30
+"""What is made ahead of its use, or kept after it, gives way where less is free."""
 _ALIGNMENT = 64
 _SETTLED = 2_000_000_000
 """Nanoseconds after which another change of a file is sure to change its times, on any file system."""
@@ -67,6 +69,43 @@ def free_bytes() -> int:
     while not folder.exists():
         folder = folder.parent
     return shutil.disk_usage(folder).free
+
+
+class Copy(NamedTuple):
+    """A copy on the disk; the least is the oldest."""
+
+    changed: int
+    """Nanoseconds since the epoch."""
+    size: int
+    """Bytes."""
+    path: Path
+
+
+def copies_by_age(paths: Iterable[Path]) -> list[Copy]:
+    """The copies that are still there, the oldest first."""
+    copies = []
+    for path in paths:
+        with contextlib.suppress(FileNotFoundError):  # another process was faster
+            status = path.stat()
+            copies.append(Copy(status.st_mtime_ns, status.st_size, path))
+    return sorted(copies)
+
+
+def remove_oldest(copies: list[Copy], excess: int) -> None:
+    """Remove the first copies until ``excess`` bytes are gone; what processes have mapped stays readable for them."""
+    for copy in copies:
+        if excess <= 0:
+            return
+        for companion in (copy.path, *(copy.path.with_suffix(suffix) for suffix in (".json", ".lock"))):
+            companion.unlink(missing_ok=True)
+        excess -= copy.size
+
+
+def copies_of_other_keys(grid_id: str, pattern: str, key: str) -> list[Copy]:
+    """Copies whose names match ``pattern`` and whose key is not ``key``, the oldest first."""
+    current = _key_suffix(key)
+    paths = series_folder(grid_id).glob(f"{pattern}.npy")
+    return copies_by_age(path for path in paths if not path.stem.endswith(current))
 
 
 def series_folder(grid_id: str) -> Path:
@@ -110,8 +149,12 @@ def is_cached(grid_id: str, name: str, key: str) -> bool:
 
 
 def _data_path(grid_id: str, name: str, key: str) -> Path:
-    stem = f"{name.replace('/', '.')}-{key[:16]}"
+    stem = f"{name.replace('/', '.')}{_key_suffix(key)}"
     return series_folder(grid_id) / f"{stem}.npy"
+
+
+def _key_suffix(key: str) -> str:
+    return f"-{key[:16]}"
 
 
 @functools.cache

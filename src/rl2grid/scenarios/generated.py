@@ -22,7 +22,16 @@ from numpy.typing import NDArray
 
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
-from rl2grid.scenarios.cache import FORMAT_VERSION, CachedSeries, cached_series, data_folder, free_bytes
+from rl2grid.scenarios.cache import (
+    FORMAT_VERSION,
+    LEFT_FREE_BYTES,
+    CachedSeries,
+    cached_series,
+    copies_by_age,
+    data_folder,
+    free_bytes,
+    remove_oldest,
+)
 from rl2grid.scenarios.fingerprint import generator_fingerprint
 from rl2grid.scenarios.folder import FolderContent
 from rl2grid.scenarios.month_names import Months, month_name, parse_months
@@ -33,9 +42,8 @@ if TYPE_CHECKING:
     from rl2grid.scenarios.generator.month import RawMonth
 
 EXPANDED_BYTES = 8 * 2**30
-"""Expanded generated months beyond this are removed, oldest first; they are expanded again when needed."""
-LEFT_FREE_BYTES = 2**30
-"""So are those without which less than this would be free: more than the largest grid's take until the next cleanup."""
+"""Expanded generated months beyond this are removed, oldest first, and those without which less than
+:data:`LEFT_FREE_BYTES` would be free; they are expanded again when needed."""
 MONTHS_BETWEEN_CLEANUPS = 50
 """A process looks for months to remove after the first one that it expands, then each time after so many more: to look
 at thousands of files takes longer than to play an episode."""
@@ -60,7 +68,7 @@ def load_generated(grid: Grid, name: str) -> CachedSeries:
 
     series = cached_series(grid.id, f"generated.{name}", generator_fingerprint(grid), expand)
     if expanded and next(_EXPANDED_MONTHS) % MONTHS_BETWEEN_CLEANUPS == 0:
-        _remove_oldest([*(data_folder() / "series" / f"v{FORMAT_VERSION}").glob("*/generated.*.npy")], EXPANDED_BYTES)
+        _keep_latest([*(data_folder() / "series" / f"v{FORMAT_VERSION}").glob("*/generated.*.npy")], EXPANDED_BYTES)
     return series
 
 
@@ -209,19 +217,8 @@ def _remove_leftovers(folder: Path, seed: int) -> None:
         path.unlink(missing_ok=True)
 
 
-def _remove_oldest(paths: list[Path], limit: int) -> None:
-    """Remove files, the latest excepted, until the rest takes at most ``limit`` bytes and some are free."""
-    status = []
-    for path in paths:
-        try:
-            status.append((path.stat().st_mtime_ns, path.stat().st_size, path))
-        except FileNotFoundError:
-            continue  # Another process was faster.
-    excess = max(sum(size for _, size, _ in status) - limit, LEFT_FREE_BYTES - free_bytes())
-    for _, size, path in sorted(status)[:-1]:
-        if excess <= 0:
-            return
-        # What other processes have mapped stays readable for them.
-        for companion in (path, *(path.with_suffix(suffix) for suffix in (".json", ".lock"))):
-            companion.unlink(missing_ok=True)
-        excess -= size
+def _keep_latest(paths: list[Path], limit: int) -> None:
+    """Remove copies, the latest excepted, until the rest takes at most ``limit`` bytes and some are free."""
+    oldest_first = copies_by_age(paths)
+    taken = sum(copy.size for copy in oldest_first)
+    remove_oldest(oldest_first[:-1], max(taken - limit, LEFT_FREE_BYTES - free_bytes()))

@@ -30,7 +30,7 @@ from rl2grid.scenarios.month_names import Months, parse_months
 from rl2grid.scenarios.progress import Report, ignore
 from rl2grid.scenarios.published import warn_of_deviation
 from rl2grid.scenarios.scenario import Scenario
-from rl2grid.scenarios.splits import HELD_OUT_SPLITS, SPLIT_VERSION, SPLITS, TRAINING_SEEDS
+from rl2grid.scenarios.splits import HELD_OUT_SPLITS, SPLIT_VERSION, SPLITS, TRAIN, TRAINING_SEEDS
 
 if TYPE_CHECKING:
     from rl2grid.scenarios.training_years import TrainingMonths
@@ -101,6 +101,19 @@ def open_series(grid_id: str, scenario_id: str) -> Scenario | TrainingMonths:
     from rl2grid.scenarios.training_years import training_months
 
     return training_months(system.grid, months)
+
+
+def check_training_room(grid_id: str, episodes: int) -> None:
+    """Refuse so many episodes of training whose months do not fit on the disk, before the first is played.
+
+    Raises:
+        UsageError: less is free than the years that they may play, of which there are no more than the library has.
+    """
+    if generator_version(grid_id, TRAIN) is None:
+        return
+    from rl2grid.scenarios.training_years import check_library_room
+
+    check_library_room(find_system(grid_id).grid, episodes)
 
 
 def import_folder(grid: Grid, path: Path, report: Report = ignore) -> Scenario:

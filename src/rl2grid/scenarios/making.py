@@ -69,18 +69,20 @@ class Years(Protocol):
 def make_library_beside(grid: Grid) -> None:
     """Begin to make what is missing of the library of training years, once per process, in idle processes of their own.
 
-    Who plays a year that is not there yet makes it, or waits for who does: nothing depends on how far they are. They
-    end with this process.
+    Where it does not fit, nothing is made ahead: some play a few years only. Who plays a year that is not there yet
+    makes it, or waits for who does: nothing depends on how far they are. They end with this process.
     """
     _make_beside(grid, data_folder())
 
 
 @functools.lru_cache(maxsize=64)
 def _make_beside(grid: Grid, data: Path) -> None:
+    from rl2grid.scenarios.training_years import has_library_room  # where it is needed, as the generator is
+
     missing = _MissingYears(grid)
     number = number_of_makers()
-    if not number or not missing:
-        return
+    if not number or not missing or not has_library_room(grid):
+        return  # what is played is made when it is played
     ignored: queue.SimpleQueue[int | str] = queue.SimpleQueue()  # who plays the year will meet what is wrong
     system, quiet = find_system(grid.id), {compile_notices.VARIABLE: "1"}
     for _ in range(number):

@@ -21,7 +21,15 @@ from rl2grid.arrays import F32, I16
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
 from rl2grid.handles import Handle
-from rl2grid.scenarios.cache import cached_series, data_folder, free_bytes, is_cached
+from rl2grid.scenarios.cache import (
+    LEFT_FREE_BYTES,
+    cached_series,
+    copies_of_other_keys,
+    data_folder,
+    free_bytes,
+    is_cached,
+    remove_oldest,
+)
 from rl2grid.scenarios.fingerprint import generator_fingerprint
 from rl2grid.scenarios.folder import FolderContent
 from rl2grid.scenarios.generator.calendar import MONTH_STEPS, month_and_row, month_start
@@ -178,7 +186,8 @@ _LOCK = threading.Lock()
 @functools.lru_cache(maxsize=8 * TRAINING_YEARS)
 def _open_year(grid: Grid, seed: int, data: Path, fingerprint: str) -> TrainingYear:
     def make() -> FolderContent:
-        _check_room(grid, data)
+        _check_year_room(grid)
+        _announce(grid, data)
         year = generate_year(grid, seed)
         arrays: dict[str, Any] = {name: getattr(year, name) for name in _ARRAYS}
         return FolderContent(month_start(load_constants(grid.id).year, 0), arrays)
@@ -188,21 +197,49 @@ def _open_year(grid: Grid, seed: int, data: Path, fingerprint: str) -> TrainingY
     return TrainingYear(load_p, load_q, prod_p, series.content_hash)
 
 
-def _file(seed: int) -> str:
+def _file(seed: int | str) -> str:
     return f"year.{seed}"
 
 
-def _check_room(grid: Grid, data: Path) -> None:
-    """Refuse a library that does not fit, before any of what is missing is written."""
-    missing = sum(not is_year_there(grid, seed) for seed in TRAINING_SEEDS) * year_bytes(grid)
-    free = free_bytes()
-    if missing > free:
+def check_library_room(grid: Grid, most: int = TRAINING_YEARS) -> None:
+    """Refuse years of the library that do not fit, before a long training begins to make them: all, or ``most``.
+
+    Raises:
+        UsageError: less is free than what is still to be written.
+    """
+    missing = min(_missing_years(grid), most) * year_bytes(grid)
+    if not _has_room(grid, missing):
         raise UsageError(
             f"The library of training months of {grid.id} takes {_gigabytes(TRAINING_YEARS * year_bytes(grid))} in "
-            f"{data}, of which {_gigabytes(missing)} are still to be written, and {_gigabytes(free)} are free: free "
-            "some, or set RL2GRID_DATA to a folder with more room."
+            f"{data_folder()}, of which up to {_gigabytes(missing)} are still to be written, and "
+            f"{_gigabytes(free_bytes())} are free: free some, or set RL2GRID_DATA to a folder with more room."
         )
-    _announce(grid, data)
+
+
+def has_library_room(grid: Grid) -> bool:
+    """Whether what is still to be written of the library fits, and leaves some to others."""
+    return _missing_years(grid) * year_bytes(grid) + LEFT_FREE_BYTES <= free_bytes()
+
+
+def _missing_years(grid: Grid) -> int:
+    return sum(not is_year_there(grid, seed) for seed in TRAINING_SEEDS)
+
+
+def _check_year_room(grid: Grid) -> None:
+    """Refuse a year that does not fit. Who plays a few needs no more than these."""
+    if not _has_room(grid, year_bytes(grid)):
+        raise UsageError(
+            f"A year of training months of {grid.id} takes {year_bytes(grid) / 1e6:,.0f} MB in {data_folder()}, and "
+            f"{free_bytes() / 1e6:,.0f} MB are free: free some, or set RL2GRID_DATA to a folder with more room."
+        )
+
+
+def _has_room(grid: Grid, needed: int) -> bool:
+    """Whether ``needed`` bytes are free; years that another generator made are removed for them, the oldest first."""
+    excess = needed - free_bytes()
+    if excess > 0:
+        remove_oldest(copies_of_other_keys(grid.id, _file("*"), generator_fingerprint(grid)), excess)
+    return needed <= free_bytes()
 
 
 @functools.lru_cache(maxsize=64)

@@ -42,6 +42,7 @@ from rl2grid.records import logs
 from rl2grid.records.locks import LockedError, locked
 from rl2grid.records.trainings import RUN_FILE, create_run_folder
 from rl2grid.records.versions import processor
+from rl2grid.scenarios.library import check_training_room
 from rl2grid.scenarios.making import number_of_makers
 from rl2grid.training.energy import EnergyAccount
 from rl2grid.training.interrupts import stop_requests
@@ -71,6 +72,8 @@ def make_envs(args: RunArgs) -> VectorEnvironment:
         UsageError: the request cannot be met.
     """
     number_of_makers()  # a setting that is refused is refused here, before there is a run folder
+    if find_algorithm(args.algorithm).plays_months and args.env_keywords.get("scenario") is None:
+        check_training_room(args.task.grid_id, args.hyperparameters.num_envs + args.hyperparameters.total_timesteps)
     register_all()
     envs: Any = gymnasium.make_vec(
         args.task.id,

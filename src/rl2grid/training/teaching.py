@@ -30,7 +30,7 @@ from rl2grid.records.files import check_folder, printable
 from rl2grid.records.label_folder import LabelFolder, open_labels
 from rl2grid.records.labels import MOST_MONTHS, Labels, MonthRow, task_identity
 from rl2grid.records.versions import library_versions
-from rl2grid.scenarios.library import draw_scenario, generator_version, make_scenarios
+from rl2grid.scenarios.library import check_training_room, draw_scenario, generator_version, make_scenarios
 from rl2grid.scenarios.splits import TRAIN
 from rl2grid.training.labeller import Labeller, says_candidates
 
@@ -176,6 +176,7 @@ def teach(
     check_folder(folder)
     # What cannot be played, or whose months have no room, is refused before anything is written.
     copy.deepcopy(setup).player().close()
+    check_training_room(task.grid_id, months)
     watch_making(task.grid_id, *make_scenarios(task.grid_id, [_job(task, seed, 0, 0).scenario]), False)
     call = command or _call(teacher, task, keywords, months, seed, pupil, pupil_share, gamma, thin, folder)
     with open_labels(folder, _request(setup, seed), _round(setup, months, call)) as labels:
