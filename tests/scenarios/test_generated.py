@@ -184,7 +184,7 @@ def test_only_the_latest_expanded_months_are_kept_and_mapped_ones_stay_readable(
 
 
 def test_expanded_months_give_way_where_little_is_free(made, monkeypatch) -> None:
-    monkeypatch.setattr(generated, "MONTHS_BETWEEN_CLEANUPS", 1)
+    monkeypatch.setattr(generated, "_EXPANDED_MONTHS", itertools.count(1))  # not when so many were expanded
     load_scenario("bus14", "generated/17-03")
     monkeypatch.setattr(generated, "free_bytes", lambda: generated.LEFT_FREE_BYTES - 1)
     load_scenario("bus14", "generated/17-04")
@@ -193,7 +193,8 @@ def test_expanded_months_give_way_where_little_is_free(made, monkeypatch) -> Non
 
 def test_months_to_remove_are_looked_for_when_some_were_expanded_not_at_every_episode(made, monkeypatch) -> None:
     looked: list[int] = []
-    monkeypatch.setattr(generated, "_keep_latest", lambda paths, limit: looked.append(len(paths)))
+    monkeypatch.setattr(generated, "_keep_latest", lambda limit: looked.append(len(generated.expanded_copies())))
+    monkeypatch.setattr(generated, "free_bytes", lambda: generated.LEFT_FREE_BYTES)
     monkeypatch.setattr(generated, "_EXPANDED_MONTHS", itertools.count())
     monkeypatch.setattr(generated, "MONTHS_BETWEEN_CLEANUPS", 2)
     for month in (3, 4, 3, 3, 5, 3):

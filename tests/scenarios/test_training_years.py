@@ -100,22 +100,25 @@ def test_a_year_that_does_not_fit_is_refused_before_anything_is_written(tmp_path
     assert not list(tmp_path.rglob("*.npy"))
 
 
-def test_years_of_another_generator_give_way_to_those_that_are_played(tmp_path: Path, monkeypatch) -> None:
+def test_years_of_another_generator_and_expanded_months_give_way_to_a_year(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setenv("RL2GRID_DATA", str(tmp_path))
-    free = 10**6
     training_year(BUS14, SEED)
     current = next(series_folder("bus14").glob("year.*.npy"))
-    for age, name in enumerate(("oldest", "older", "latest")):
-        stale = current.with_name(f"year.{SEED}-{name}.npy")
-        stale.write_bytes(bytes(3 * 10**6))
-        os.utime(stale, (1000 + age, 1000 + age))
-
-    def left() -> list[str]:
-        return sorted(path.stem.partition("-")[2] for path in current.parent.glob("year.*.npy"))
-
-    monkeypatch.setattr(training_years, "free_bytes", lambda: free + 3 * 10**6 * (4 - len(left())))
+    removable = [current.with_name(f"{name}.npy") for name in ("year.1-older", "year.1-old", "generated.3-04-older")]
+    kept = current.with_name("generated.3-04-latest.npy")
+    for age, path in enumerate((*removable, kept)):
+        path.write_bytes(bytes(10**6))
+        os.utime(path, (1000 + age, 1000 + age))
+    monkeypatch.setattr(
+        training_years,
+        "free_bytes",
+        lambda: training_years.year_bytes(BUS14) - 10**6 * sum(path.exists() for path in removable),
+    )
     training_year(BUS14, SEED + 1)
-    assert left() == sorted(["latest", *2 * [current.stem.partition("-")[2]]])
+    assert not any(path.exists() for path in removable)
+    assert kept.exists()
+    assert is_year_there(BUS14, SEED)
+    assert is_year_there(BUS14, SEED + 1)
 
 
 def test_an_unwritable_data_folder_is_named(tmp_path: Path, monkeypatch) -> None:

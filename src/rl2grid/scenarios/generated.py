@@ -26,6 +26,7 @@ from rl2grid.scenarios.cache import (
     FORMAT_VERSION,
     LEFT_FREE_BYTES,
     CachedSeries,
+    Copy,
     cached_series,
     copies_by_age,
     data_folder,
@@ -45,8 +46,8 @@ EXPANDED_BYTES = 8 * 2**30
 """Expanded generated months beyond this are removed, oldest first, and those without which less than
 :data:`LEFT_FREE_BYTES` would be free; they are expanded again when needed."""
 MONTHS_BETWEEN_CLEANUPS = 50
-"""A process looks for months to remove after the first one that it expands, then each time after so many more: to look
-at thousands of files takes longer than to play an episode."""
+"""A process looks for months to remove after the first one that it expands, then each time after so many more, and
+where less than :data:`LEFT_FREE_BYTES` is free: to look at thousands of files takes longer than to play an episode."""
 _LOCKS = 64
 _EXPANDED_MONTHS = itertools.count()
 """How many this process has expanded so far."""
@@ -67,9 +68,14 @@ def load_generated(grid: Grid, name: str) -> CachedSeries:
         return _content(grid, months)
 
     series = cached_series(grid.id, f"generated.{name}", generator_fingerprint(grid), expand)
-    if expanded and next(_EXPANDED_MONTHS) % MONTHS_BETWEEN_CLEANUPS == 0:
-        _keep_latest([*(data_folder() / "series" / f"v{FORMAT_VERSION}").glob("*/generated.*.npy")], EXPANDED_BYTES)
+    if expanded and (next(_EXPANDED_MONTHS) % MONTHS_BETWEEN_CLEANUPS == 0 or free_bytes() < LEFT_FREE_BYTES):
+        _keep_latest(EXPANDED_BYTES)
     return series
+
+
+def expanded_copies() -> list[Copy]:
+    """The expanded months of all grids, the oldest first: they may be removed, and are expanded again when needed."""
+    return copies_by_age((data_folder() / "series" / f"v{FORMAT_VERSION}").glob("*/generated.*.npy"))
 
 
 def pack_folder(grid: Grid) -> Path:
@@ -217,8 +223,8 @@ def _remove_leftovers(folder: Path, seed: int) -> None:
         path.unlink(missing_ok=True)
 
 
-def _keep_latest(paths: list[Path], limit: int) -> None:
-    """Remove copies, the latest excepted, until the rest takes at most ``limit`` bytes and some are free."""
-    oldest_first = copies_by_age(paths)
-    taken = sum(copy.size for copy in oldest_first)
-    remove_oldest(oldest_first[:-1], max(taken - limit, LEFT_FREE_BYTES - free_bytes()))
+def _keep_latest(limit: int) -> None:
+    """Remove expanded months, the latest excepted, until the rest takes at most ``limit`` bytes and some are free."""
+    copies = expanded_copies()
+    taken = sum(copy.size for copy in copies)
+    remove_oldest(copies[:-1], max(taken - limit, LEFT_FREE_BYTES - free_bytes()))

@@ -32,6 +32,7 @@ from rl2grid.scenarios.cache import (
 )
 from rl2grid.scenarios.fingerprint import generator_fingerprint
 from rl2grid.scenarios.folder import FolderContent
+from rl2grid.scenarios.generated import expanded_copies
 from rl2grid.scenarios.generator.calendar import MONTH_STEPS, month_and_row, month_start
 from rl2grid.scenarios.generator.constants import load_constants
 from rl2grid.scenarios.generator.forecast import ForecastModel, forecast_model, forecast_row
@@ -235,10 +236,11 @@ def _check_year_room(grid: Grid) -> None:
 
 
 def _has_room(grid: Grid, needed: int) -> bool:
-    """Whether ``needed`` bytes are free; years that another generator made are removed for them, the oldest first."""
+    """Whether ``needed`` bytes are free; years that another generator made, then expanded months, give way to them."""
     excess = needed - free_bytes()
     if excess > 0:
-        remove_oldest(copies_of_other_keys(grid.id, _file("*"), generator_fingerprint(grid)), excess)
+        stale = copies_of_other_keys(grid.id, _file("*"), generator_fingerprint(grid))
+        remove_oldest([*stale, *expanded_copies()], excess)
     return needed <= free_bytes()
 
 
