@@ -44,6 +44,7 @@ from rl2grid.powerflow.newton import (
 )
 from rl2grid.powerflow.topology import (
     ADJACENT,
+    ends_on_first,
     insert,
     join_themselves,
     measure_fill,
@@ -56,7 +57,7 @@ _NO_ROOM = -1
 _FEW = 2
 """Lanes that are not worth a step of all: eight take three to four times as long as one."""
 _LIKENESS = 8
-"""Topologies are alike if at most one in so many elements is elsewhere: the fill of a union grows with what its rows
+"""Patterns are alike if at most one in so many elements is elsewhere: the fill of a union grows with what its rows
 have not in common."""
 _SMALLEST = 1e-13
 """A lane whose pivot is this much smaller than what was there before it is left to the row alone, which gives up a
@@ -103,12 +104,12 @@ def new_union(flow: FlowState) -> Union:
 
 
 @borrowing_jit
-def is_like(topology: I32, other: I32) -> bool:
-    """Whether two topology vectors differ so little that their union is worth it."""
+def is_like(pattern: I32, other: I32) -> bool:
+    """Whether two patterns differ so little that their union is worth it."""
     n_different = 0
-    for k in range(topology.shape[0]):
-        n_different += topology[k] != other[k]
-    return bool(n_different * _LIKENESS <= topology.shape[0])
+    for k in range(pattern.shape[0]):
+        n_different += pattern[k] != other[k]
+    return bool(n_different * _LIKENESS <= pattern.shape[0])
 
 
 @borrowing_jit
@@ -196,7 +197,7 @@ def _unite(network: Network, flow: FlowState, lanes: FlowLanes, union: Union, n:
     n_free = _number_nodes(network, flow, lanes, union, n)
     adjacent = flow.sets[ADJACENT]
     join_themselves(n_free + 1, adjacent)
-    _join_nodes(flow, lanes, union, n, adjacent)
+    _join_nodes(network, flow, lanes, union, n, adjacent)
     if _count_pairs(n_free + 1, adjacent) > union.admittance_node.shape[0]:
         return np.int64(_NO_ROOM)
     n_entries = write_entries(n_free + 1, adjacent, union.admittance_first, union.admittance_node, union.diagonal_entry)
@@ -256,15 +257,18 @@ def _unknowns_of(flow: FlowState, i: Index, node: Index) -> int:
 
 
 @borrowing_jit
-def _join_nodes(flow: FlowState, lanes: FlowLanes, union: Union, n: int, adjacent: U64) -> None:
-    """Join the ends of the lines of all rows."""
+def _join_nodes(network: Network, flow: FlowState, lanes: FlowLanes, union: Union, n: int, adjacent: U64) -> None:
+    """Join the ends of the lines of all rows, of open ones where the rows have room for them."""
     first_or, first_ex = flow.line_or_node[lanes.row[0]], flow.line_ex_node[lanes.row[0]]
     for lane in range(n):
         line_or, line_ex = flow.line_or_node[lanes.row[lane]], flow.line_ex_node[lanes.row[lane]]
         for line in range(line_or.shape[0]):
-            if line_or[line] == ABSENT:
-                continue
-            origin, extremity = union.node[lane, line_or[line]], union.node[lane, line_ex[line]]
+            own_or, own_ex = line_or[line], line_ex[line]
+            if own_or == ABSENT:
+                own_or, own_ex = ends_on_first(network, flow, lanes.row[lane], line)
+                if own_or == ABSENT or own_ex == ABSENT:
+                    continue
+            origin, extremity = union.node[lane, own_or], union.node[lane, own_ex]
             if (
                 lane > 0
                 and first_or[line] != ABSENT

@@ -21,6 +21,7 @@ class FlowLanes(NamedTuple):
 
     magnitude: Annotated[Lanes, workspace("bus lane")]
     angle: Annotated[Lanes, workspace("bus lane")]
+    admittance: Annotated[Lanes, workspace("entry 2 lane")]
     voltage: Annotated[Lanes, workspace("bus 2 lane")]
     injection: Annotated[Lanes, workspace("bus 2 lane")]
     power: Annotated[Lanes, workspace("bus 2 lane")]
@@ -45,6 +46,7 @@ def new_flow_lanes(flow: FlowState) -> FlowLanes:
     sizes = {
         "bus": flow.magnitude.shape[1],
         "unknown": len(flow.step),
+        "entry": flow.admittance.shape[1],
         "value": 2 * flow.panel.shape[1],  # rows of different topologies need more than one of them
         "line": flow.line_or_node.shape[1],
         "lane": WIDTH,

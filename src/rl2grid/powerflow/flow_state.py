@@ -23,6 +23,10 @@ class FlowState(NamedTuple):
 
     A *node* is a bus with at least one element, numbered in elimination order; the slack bus comes last. Every
     other node has one unknown (its angle) if a generator holds its voltage, else two (angle, then magnitude).
+
+    Matrices have room for open lines, between the nodes of busbar 1 at their ends: rows that differ only in the lines
+    that are open have one pattern, and can be solved side by side. It is equal where ``pattern`` is.
+
     Threads that work on different rows need workspaces of their own
     (:func:`rl2grid.structures.with_own_workspace`).
     """
@@ -30,6 +34,7 @@ class FlowState(NamedTuple):
     order: Annotated[I32, constant("bus", "buses in elimination order; the slack substation's last")]
 
     topo_vect: Annotated[I32, row("topo", "of the last call")]
+    pattern: Annotated[I32, row("topo", "topo_vect, but ends of open lines on busbar 1 where that has a node")]
     known: Annotated[Flags, row("", "the arrays below describe topo_vect")]
     connected: Annotated[Flags, row("", "no load or generator is disconnected and no bus is cut off from the slack")]
     warm: Annotated[Flags, row("", "voltages solve the last flow, which had this topology")]
@@ -47,7 +52,7 @@ class FlowState(NamedTuple):
 
     admittance_first: Annotated[U16, row("pointer", "row pointers of the admittance matrix")]
     admittance_node: Annotated[U16, row("entry", "columns, ascending within a row")]
-    admittance: Annotated[F64, row("entry 2", "real and imaginary", "per unit")]
+    admittance: Annotated[F64, row("entry 2", "real and imaginary, 0 where only open lines lead", "per unit")]
     admittance_panel: Annotated[U32, row("entry", "where the entry's block of the Jacobian begins in panel")]
     line_entry: Annotated[U16, row("line 2", "entries (origin, extremity) and (extremity, origin)")]
     diagonal_entry: Annotated[U16, row("bus")]

@@ -33,6 +33,7 @@ from rl2grid.powerflow.lanes import WIDTH, Lanes, at, fma, larger, load, root, s
 from rl2grid.powerflow.model import Network
 from rl2grid.powerflow.newton import fill_jacobian
 from rl2grid.powerflow.paths import Paths, solve_backward, solve_forward, write_path, write_path_product
+from rl2grid.powerflow.topology import is_joined
 from rl2grid.structures import allocate, constant, workspace
 
 LARGEST_SITE = 32
@@ -251,7 +252,8 @@ def _find_parts(flow: FlowState, i: Index, equations: Equations, site: Site, fir
                 visited += 1
                 for entry in range(equations.admittance_first[node], equations.admittance_first[node + 1]):
                     other = equations.admittance_node[entry]
-                    if label[other] < 0 and other != first and other != second:
+                    joined = is_joined(equations.admittance, entry)
+                    if joined and label[other] < 0 and other != first and other != second:
                         label[other] = n_parts
                         queue[found] = other
                         found += 1

@@ -27,6 +27,7 @@ from rl2grid.powerflow.lane_flow import (
 from rl2grid.powerflow.lanes import WIDTH, root, store
 from rl2grid.powerflow.model import Network
 from rl2grid.powerflow.paths import Paths, solve_backward, solve_forward, write_path_product
+from rl2grid.powerflow.topology import is_joined
 from rl2grid.structures import allocate, workspace
 
 
@@ -254,6 +255,8 @@ def is_bridge(flow: FlowState, i: Index, equations: Equations, switches: Switche
         visited += 1
         for entry in range(equations.admittance_first[here], equations.admittance_first[here + 1]):
             there = np.int64(equations.admittance_node[entry])
+            if not is_joined(equations.admittance, entry):
+                continue
             if there == extremity:
                 if here != origin:
                     return False

@@ -156,10 +156,12 @@ def _transposed(builder: Any, vectors: list[Any]) -> list[Any]:
 
 
 def _row_addresses(context: Any, builder: Any, kinds: Any, rows: Any, chosen: Any, column: Any) -> list[Any]:
-    """Where ``WIDTH`` numbers of each chosen row of a matrix begin."""
+    """Where ``WIDTH`` numbers of each chosen row of a matrix, of two axes or more, begin."""
     matrix = context.make_array(kinds[0])(context, builder, rows)
     numbers = context.make_array(kinds[1])(context, builder, chosen).data
-    width = cgutils.unpack_tuple(builder, matrix.shape)[1]
+    _, width, *further = cgutils.unpack_tuple(builder, matrix.shape)
+    for size in further:
+        width = builder.mul(width, size)
     found = []
     for lane in range(WIDTH):
         row = builder.load(cgutils.gep_inbounds(builder, numbers, ir.Constant(ir.IntType(64), lane)))
@@ -172,7 +174,8 @@ def _row_addresses(context: Any, builder: Any, kinds: Any, rows: Any, chosen: An
 def load_columns(typing_context: Any, matrix: Any, rows: Any, column: Any, array: Any) -> Any:
     """Copy ``WIDTH`` columns of a matrix, float64, to as many rows of an array of lanes; unchecked.
 
-    Lane l is given row ``rows[l]``, int64; the first column, int64, is the first row of the array too.
+    Lane l is given row ``rows[l]``, int64; the first column, int64, is the first row of the array too. Columns are
+    counted over all axes but the first.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:

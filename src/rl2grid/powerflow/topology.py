@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rl2grid.arrays import I32, U16, U32, U64, Index
+from rl2grid.arrays import F64, I32, U16, U32, U64, Index
 from rl2grid.compile import borrowing_jit
 from rl2grid.powerflow.bits import count_bits, lowest_bit
 from rl2grid.powerflow.flow_state import ABSENT, FlowState
@@ -47,6 +47,7 @@ def build_nodes(network: Network, flow: FlowState, i: int, topo_vect: I32) -> bo
     _join_nodes(flow.line_or_node[i], flow.line_ex_node[i], n_node, adjacent)
     if not _is_connected(n_node, adjacent, flow.sets[_LOWER], flow.diagonal_entry[i]):
         return False
+    _join_open_lines(network, flow, i, topo_vect, adjacent)
     _fill_admittance(network, flow, i, adjacent)
     return True
 
@@ -156,6 +157,36 @@ def _join_nodes(line_or: U16, line_ex: U16, n_node: Index, adjacent: U64) -> Non
         if line_or[line] != ABSENT:
             insert(adjacent, line_or[line], line_ex[line])
             insert(adjacent, line_ex[line], line_or[line])
+
+
+@borrowing_jit
+def _join_open_lines(network: Network, flow: FlowState, i: int, topo_vect: I32, adjacent: U64) -> None:
+    """Make room in the matrices for open lines, and write the pattern."""
+    pattern = flow.pattern[i]
+    remember_topology(pattern, topo_vect)
+    line_or = flow.line_or_node[i]
+    for line in range(line_or.shape[0]):
+        if line_or[line] != ABSENT:
+            continue
+        origin, extremity = ends_on_first(network, flow, i, line)
+        pattern[network.line_or_position[line]] = -1 if origin == ABSENT else 1
+        pattern[network.line_ex_position[line]] = -1 if extremity == ABSENT else 1
+        if origin != ABSENT and extremity != ABSENT:
+            insert(adjacent, origin, extremity)
+            insert(adjacent, extremity, origin)
+
+
+@borrowing_jit
+def ends_on_first(network: Network, flow: FlowState, i: Index, line: Index) -> tuple[np.uint16, np.uint16]:
+    """The nodes of row ``i`` that are busbar 1 at the ends of a line, each ABSENT if nothing is connected to it."""
+    node_of_bus = flow.node_of_bus[i]
+    return node_of_bus[network.line_or_sub[line]], node_of_bus[network.line_ex_sub[line]]
+
+
+@borrowing_jit
+def is_joined(admittance: F64, entry: Index) -> bool:
+    """Whether closed lines lead where an entry of the admittance matrix, float64 [entry, 2], has room for them."""
+    return bool(admittance[entry, 0] != 0.0 or admittance[entry, 1] != 0.0)
 
 
 @borrowing_jit

@@ -1,4 +1,4 @@
-"""Flows of several rows of one topology that go on from their last ones, side by side.
+"""Flows of several rows of one pattern that go on from their last ones, side by side.
 
 Each lane takes the steps that :func:`rl2grid.powerflow.newton.solve_warm` takes for a row alone, by the same functions
 and verdicts, so that the bits of a flow depend neither on the rows beside it nor on whether there are any. What a lane
@@ -24,7 +24,7 @@ from rl2grid.powerflow.flow_lanes import (
 )
 from rl2grid.powerflow.flow_state import ABSENT, Equations, FlowState, factors_of
 from rl2grid.powerflow.lane_flow import DONE, FAILED, RUNNING
-from rl2grid.powerflow.lanes import WIDTH, load, load_columns, splat, store, store_columns
+from rl2grid.powerflow.lanes import WIDTH, Lanes, at, load, load_columns, store, store_columns
 from rl2grid.powerflow.model import Network
 from rl2grid.powerflow.newton import (
     ARRIVED,
@@ -36,13 +36,14 @@ from rl2grid.powerflow.newton import (
     measure_mismatch,
     write_voltage,
 )
+from rl2grid.powerflow.topology import is_same_topology
 
 
 @borrowing_jit
 def solve_warm_side_by_side(
     network: Network, flow: FlowState, lanes: FlowLanes, n: int, gen_v: F32 | F64, a_or: F32
 ) -> None:
-    """Solve the flows of the first ``n`` lanes' rows, which were prepared, have one topology and may go on.
+    """Solve the flows of the first ``n`` lanes' rows, which were prepared, have one pattern and may go on.
 
     Lanes end as DONE, voltages and factors of their rows written, or as FAILED, their rows untouched.
 
@@ -57,7 +58,7 @@ def solve_warm_side_by_side(
     i = lanes.row[0]
     n_free = np.int64(flow.n_node[i]) - 1
     equations = Equations(
-        n_free, flow.first_unknown[i], flow.admittance_first[i], flow.admittance_node[i], flow.admittance[i],
+        n_free, flow.first_unknown[i], flow.admittance_first[i], flow.admittance_node[i], lanes.admittance,
         flow.admittance_panel[i], lanes.magnitude, lanes.angle, lanes.voltage, lanes.injection, lanes.power, lanes.step,
     )  # fmt: skip
     factors = factors_of(flow, i, flow.column[i], lanes.panel, lanes.sparse_row)
@@ -67,7 +68,8 @@ def solve_warm_side_by_side(
         lanes.state[lane] = FAILED
         if lane < n:
             _begin(flow, lanes, lane, gen_v[lanes.row[lane]])
-    _gather_factors(flow, lanes, n, n_values)
+    _write_admittance(flow, lanes, n, 2 * np.int64(flow.admittance_first[i, n_free + 1]))
+    _gather(flow.panel, lanes, n, n_values, lanes.panel)
     write_voltage(equations)
     store(lanes.mismatch, 0, measure_mismatch(equations))
     n_steps = 0
@@ -83,7 +85,7 @@ def solve_warm_side_by_side(
         store(lanes.mismatch_before, 0, load(lanes.mismatch, 0))
         store(lanes.mismatch, 0, measure_mismatch(equations))
         n_steps += 1
-    _write_currents(network, flow, i, lanes)
+    _write_currents(network, flow, lanes, n)
     for lane in range(n):
         if lanes.state[lane] == DONE:
             _finish(flow, lanes, lane, a_or[lanes.row[lane]])
@@ -108,15 +110,30 @@ def _begin(flow: FlowState, lanes: FlowLanes, lane: Index, gen_v: F32 | F64) -> 
 
 
 @borrowing_jit
-def _gather_factors(flow: FlowState, lanes: FlowLanes, n: Index, n_values: Index) -> None:
-    """Copy the factors of all rows to their lanes."""
+def _write_admittance(flow: FlowState, lanes: FlowLanes, n: Index, n_values: Index) -> None:
+    """Copy the admittance matrices of all rows to their lanes, of which there is often but one."""
+    topology, differ = flow.topo_vect[lanes.row[0]], False
+    for lane in range(1, n):
+        differ |= not is_same_topology(topology, flow.topo_vect[lanes.row[lane]])
+    if differ:
+        _gather(flow.admittance, lanes, n, n_values, lanes.admittance)
+        return
+    values = flow.admittance[lanes.row[0]]
+    for k in range(n_values):
+        store(lanes.admittance, k, at(values, k))
+
+
+@borrowing_jit
+def _gather(values: F64, lanes: FlowLanes, n: Index, n_values: Index, array: Lanes) -> None:
+    """Copy the first values of all rows to their lanes."""
     whole = n_values - n_values % WIDTH if n == WIDTH else 0
     for k in range(0, whole, WIDTH):
-        load_columns(flow.panel, lanes.row, k, lanes.panel)
+        load_columns(values, lanes.row, k, array)
+    flat = array.reshape(-1, WIDTH)
     for lane in range(n):
-        panel, column = flow.panel[lanes.row[lane]], np.uint64(lane)
+        own, column = values[lanes.row[lane]].reshape(-1), np.uint64(lane)
         for k in range(whole, n_values):
-            lanes.panel[k, column] = panel[k]
+            flat[k, column] = own[k]
 
 
 @borrowing_jit
@@ -156,13 +173,17 @@ def _judge(lanes: FlowLanes, n: Index, n_steps: int, tolerance: float) -> bool:
 
 
 @borrowing_jit
-def _write_currents(network: Network, flow: FlowState, i: Index, lanes: FlowLanes) -> None:
-    voltage, origins, extremities = lanes.voltage, flow.line_or_node[i], flow.line_ex_node[i]
-    for line in range(origins.shape[0]):
-        if origins[line] == ABSENT:
-            store(lanes.current, line, splat(0.0))
+def _write_currents(network: Network, flow: FlowState, lanes: FlowLanes, n: Index) -> None:
+    """Currents of lines that are closed in any row, in all lanes."""
+    voltage = lanes.voltage
+    for line in range(flow.line_or_node.shape[1]):
+        lane = 0
+        while lane < n and flow.line_or_node[lanes.row[lane], line] == ABSENT:
+            lane += 1
+        if lane == n:
             continue
-        origin, extremity = TWO * origins[line], TWO * extremities[line]
+        i = lanes.row[lane]
+        origin, extremity = TWO * flow.line_or_node[i, line], TWO * flow.line_ex_node[i, line]
         current = line_current(
             network, line, load(voltage, origin), load(voltage, origin + ONE), load(voltage, extremity),
             load(voltage, extremity + ONE),
@@ -186,5 +207,6 @@ def _finish(flow: FlowState, lanes: FlowLanes, lane: Index, a_or: F32) -> None:
         angle[node] = lanes.angle[node, column]
         voltage[node, 0] = lanes.voltage[node, 0, column]
         voltage[node, 1] = lanes.voltage[node, 1, column]
+    origins = flow.line_or_node[i]
     for line in range(a_or.shape[0]):
-        a_or[line] = amperes(lanes.current[line, column])
+        a_or[line] = np.float32(0.0) if origins[line] == ABSENT else amperes(lanes.current[line, column])

@@ -100,12 +100,12 @@ def _solve_cold(environments: Environments, n_lanes: int) -> int:
 
 @jit
 def _gather_warm(environments: Environments, rows: I64, n: int, status: I64, first: int) -> int:
-    """Give lanes to the rows that go on as row ``first`` does, with the same topology; how many there are."""
+    """Give lanes to the rows that go on as row ``first`` does, with the same pattern; how many there are."""
     flow, n_lanes = environments.flow, 0
-    topology = flow.topo_vect[rows[first]]
+    pattern = flow.pattern[rows[first]]
     for k in range(first, n):
         i = rows[k]
-        if status[k] == PREPARED and may_go_on(flow, i) and is_same_topology(topology, flow.topo_vect[i]):
+        if status[k] == PREPARED and may_go_on(flow, i) and is_same_topology(pattern, flow.pattern[i]):
             n_lanes = _give_lane(environments, i, k, n_lanes)
             if n_lanes == WIDTH:
                 break
@@ -117,13 +117,13 @@ def _gather_cold(environments: Environments, rows: I64, n: int, status: I64, fir
     """Give lanes to the rows that begin anew as row ``first`` does and are like it; how many there are."""
     network, flow, n_lanes = environments.network, environments.flow, 0
     slack = network.gen_position[network.slack_gen[0]]
-    topology = flow.topo_vect[rows[first]]
+    pattern = flow.pattern[rows[first]]
     for k in range(first, n):
         i = rows[k]
         if status[k] != PREPARED or not flow.known[i] or may_go_on(flow, i):
             continue
-        other = flow.topo_vect[i]
-        if other[slack] == topology[slack] and is_like(other, topology):
+        other = flow.pattern[i]
+        if other[slack] == pattern[slack] and is_like(other, pattern):
             n_lanes = _give_lane(environments, i, k, n_lanes)
             if n_lanes == WIDTH:
                 break
