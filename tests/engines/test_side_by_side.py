@@ -10,7 +10,7 @@ import pytest
 from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.engines.native.transitions import NativeTransitions, commands_of
 from rl2grid.grids import load_grid
-from rl2grid.mdp.actions import DO_NOTHING, StepAction, full_catalogue, level_catalogue
+from rl2grid.mdp.actions import DO_NOTHING, StepAction, full_catalogue, level_catalogue, switch
 from rl2grid.mdp.rewards import PRESETS
 from rl2grid.powerflow.flow_lanes import LOST
 from rl2grid.powerflow.lane_flow import DONE, FAILED
@@ -91,6 +91,27 @@ def test_a_row_of_a_topology_of_its_own_does_not_depend_on_its_company(grid_id, 
     assert DONE in both[0].lane_states
     if grid_id == "bus14":
         assert LOST in both[0].lane_states, "some diverged"
+
+
+@pytest.mark.parametrize("grid_id", ["bus36-M", "bus118-M"])
+def test_rows_that_differ_in_their_open_lines_alone_are_solved_side_by_side(grid_id):
+    both = [Played(grid_id, None, together) for together in (True, False)]
+    for played in both:
+        played.step([switch(2 * i) for i in range(N)])
+    for _ in range(STEPS):
+        for played in both:
+            played.step([DO_NOTHING] * N)
+        together, alone = (played.kept() for played in both)
+        for name, values in together.items():
+            np.testing.assert_array_equal(values, alone[name], err_msg=name)
+    environments = both[0].environments
+    lasting = ~environments.state.terminated
+    assert lasting.sum() > N // 2
+    assert len(np.unique(environments.flow.topo_vect[lasting], axis=0)) > N // 3, "different lines are open"
+    assert len(np.unique(environments.flow.pattern[lasting], axis=0)) == 1, "and their matrices have one pattern"
+    assert DONE in both[0].lane_states
+    topologies = environments.flow.topo_vect[environments.lanes.row[environments.lanes.state == DONE]]
+    assert len(np.unique(topologies, axis=0)) > 1, "lanes of the last step had different topologies"
 
 
 def play_both(both: list[Played], actions: Sequence[StepAction], share: float) -> None:
