@@ -46,7 +46,7 @@ def test_defaults_are_those_of_the_rooms_below():
         return {name: one.default for name, one in inspect.signature(function).parameters.items()}
 
     mine, theirs = defaults(rl2grid.evaluate), defaults(protocol.evaluate)
-    for name in ("split", "scenarios", "seeds", "output", "progress"):
+    for name in ("split", "months", "scenarios", "seeds", "output", "progress"):
         assert mine[name] == theirs[name], name
     stored = {each.name: each.default for each in fields(RunArgs)}
     for name in ("evaluate_every", "validation_months", "progress"):

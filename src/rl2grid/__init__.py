@@ -176,6 +176,7 @@ def evaluate(
     task: Task | str,
     *,
     split: str = "validation",
+    months: int | None = None,
     scenarios: Sequence[str] | None = None,
     seeds: Sequence[int] = (0,),
     output: str | Path | None = None,
@@ -189,7 +190,8 @@ def evaluate(
             agent that is not bound to an environment yet.
         task: The task or its id; the namespace and the version of an id may be left out.
         split: ``"validation"`` to choose by, ``"test"`` for the last number, ``"train"`` or ``"bundled"``.
-        scenarios: Play these months only; None: all of the split.
+        months: Play the first so many of the split; None: all of it.
+        scenarios: Play these of the split only, instead of the first ones.
         seeds: Of maintenance, opponent and agent: episodes per month.
         output: Folder to store the evaluation in, and to go on with; None: nothing is stored.
         progress: Whether to show a progress bar.
@@ -208,6 +210,7 @@ def evaluate(
         agent,
         task,
         split=split,
+        months=months,
         scenarios=scenarios,
         seeds=seeds,
         output=None if output is None else Path(output),

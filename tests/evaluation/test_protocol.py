@@ -311,6 +311,9 @@ def test_bad_requests_are_refused_in_one_sentence_before_months_are_made(tmp_pat
         "choose one of None, idle, recovery": {"heuristic": "lazy"},
         "is not in the split validation of bus14": {"scenarios": ["nowhere"]},
         "No scenario was given": {"scenarios": []},
+        "has 200; give a number from 1 to 200": {"months": 201},
+        "months='two' is not allowed": {"months": "two"},
+        "exclude each other": {"months": 2, "scenarios": ["generated/710000-00"]},
         "give at least one integer": {"seeds": []},
         "none negative": {"seeds": [-1]},
         "given twice": {"seeds": [3, 3]},
@@ -326,9 +329,20 @@ def test_bad_requests_are_refused_in_one_sentence_before_months_are_made(tmp_pat
     assert list(tmp_path.iterdir()) == []
 
 
-def test_recovery_refuses_tasks_without_topology():
+def test_what_an_agent_refuses_is_known_before_months_are_made(monkeypatch):
+    def make(*request):
+        yield 0
+        pytest.fail("months are made")
+
+    monkeypatch.setattr(evaluation, "make_scenarios", lambda *request: (make(), 1))
     with pytest.raises(UsageError, match="cannot play a redispatching task"):
         evaluate("recovery", "bus14-R")
+
+
+def test_the_first_months_of_a_split_are_played():
+    played = evaluate("do-nothing", "bus14-T0", months=2)
+    assert tuple(episode.scenario for episode in played.episodes) == list_scenarios("bus14", "validation")[:2]
+    assert "months=2" in played.command
 
 
 @pytest.mark.parametrize("grid_id", GRID_IDS)

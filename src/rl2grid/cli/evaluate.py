@@ -21,7 +21,7 @@ from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import make_agent
 from rl2grid.evaluation.flags import environment_flags, evaluate_command
 from rl2grid.evaluation.places import default_folder
-from rl2grid.evaluation.protocol import check_playable, evaluate, first_months
+from rl2grid.evaluation.protocol import check_playable, evaluate
 from rl2grid.records.collection import LAST_POLICY
 from rl2grid.records.evaluations import Evaluation
 from rl2grid.records.methods import Method, group_methods
@@ -130,7 +130,7 @@ def _evaluated(agent: str, made: Agent, task: Task, options: argparse.Namespace,
         made if own else agent,
         task,
         split=options.split,
-        scenarios=None if options.months is None else first_months(task, options.split, options.months),
+        months=options.months,
         seeds=range(options.seeds),
         workers=options.workers,
         output=options.output or _default_output(agent, made, options, task, chosen),

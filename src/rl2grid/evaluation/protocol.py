@@ -53,6 +53,7 @@ def evaluate(
     task: Task | str,
     *,
     split: str = "validation",
+    months: int | None = None,
     scenarios: Sequence[str] | None = None,
     seeds: Sequence[int] = (0,),
     start: int = 0,
@@ -72,7 +73,8 @@ def evaluate(
             environment yet.
         task: the task, or its id, whose namespace and version may be left out.
         split: whose scenarios are played: ``"validation"``, ``"test"``, ``"train"`` or ``"bundled"``.
-        scenarios: play these only; None: all of the split.
+        months: play the first so many of the split, of all seasons alike; None: all of it.
+        scenarios: play these of the split only, instead of the first ones.
         seeds: of maintenance, opponent and agent; each scenario has its own draws with the same seed
             (:func:`rl2grid.evaluation.episode.environment_seed`).
         start: row of each scenario at which its episodes begin.
@@ -94,19 +96,22 @@ def evaluate(
     keywords = env_keywords(chosen, {**options, "split": split, "heuristic": heuristic})
     options_of(task, keywords)
     resolve_reward(keywords.get("reward", "default"))
-    chosen_scenarios = _checked_scenarios(task, split, scenarios)
+    chosen_scenarios = _checked_scenarios(task, split, months, scenarios)
     jobs = _jobs(chosen_scenarios, seeds, start)
     _check_lengths(task, chosen_scenarios, start, keywords.get("episode_length"))
     processes = _number_of_workers(workers, TaskOptions(**keywords).engine, agent, len(jobs))
     if output is not None:
         check_folder(output)  # before months are made, which takes minutes
+    # The agent whose identity is stored, not its path: a run that still trains replaces the file.
+    setting = Setting(task.id, chosen, keywords)
+    if not _are_made(task.grid_id, chosen_scenarios):
+        setting.player().close()  # what the agent refuses, likewise
     watch_making(task.grid_id, *make_scenarios(task.grid_id, chosen_scenarios), progress)
     return run_evaluation(
-        # The agent whose identity is stored, not its path: a run that still trains replaces the file.
-        Setting(task.id, chosen, keywords),
+        setting,
         jobs,
         identity=_identity(task, chosen, printable(name or chosen.name), keywords, start, chosen_scenarios),
-        command=command or _call(agent, task, keywords, scenarios, seeds, start, name),
+        command=command or _call(agent, task, keywords, months, scenarios, seeds, start, name),
         workers=processes,
         output=output,
         progress=progress,
@@ -135,9 +140,9 @@ def first_months(task: Task, split: str, months: int | None) -> tuple[str, ...]:
         UsageError: no such split, or a number of months below 1 or above what there is.
     """
     listed = list_scenarios(task.grid_id, split)
-    if months is not None and not 1 <= months <= len(listed):
+    if months is not None and (not isinstance(months, int) or not 1 <= months <= len(listed)):
         raise UsageError(
-            f"months={months} is not allowed: the split {split} of {task.grid_id} has {len(listed)}; give a number "
+            f"months={months!r} is not allowed: the split {split} of {task.grid_id} has {len(listed)}; give a number "
             f"from 1 to {len(listed)}."
         )
     return listed[:months]
@@ -227,9 +232,11 @@ def _number_of_workers(workers: int | None, engine: str, agent: str | Path | Age
     return workers
 
 
-def _checked_scenarios(task: Task, split: str, scenarios: Sequence[str] | None) -> tuple[str, ...]:
+def _checked_scenarios(task: Task, split: str, months: int | None, scenarios: Sequence[str] | None) -> tuple[str, ...]:
     if scenarios is None:
-        return list_scenarios(task.grid_id, split)
+        return first_months(task, split, months)
+    if months is not None:
+        raise UsageError(f"months={months!r} and scenarios exclude each other: give one of them.")
     if not scenarios:
         raise UsageError(f"No scenario was given: name some of the split {split} of {task.grid_id}, or leave it out.")
     for scenario in scenarios:
@@ -247,6 +254,12 @@ def _check_lengths(task: Task, scenarios: Sequence[str], start: int, episode_len
         check_length(
             scenario, MAX_STEPS if whole else load_scenario(task.grid_id, scenario).n_steps, episode_length, start
         )
+
+
+def _are_made(grid_id: str, scenarios: Sequence[str]) -> bool:
+    """Whether all months are there."""
+    made, total = make_scenarios(grid_id, scenarios)
+    return next(made) == total
 
 
 def _jobs(scenarios: Sequence[str], seeds: Sequence[int], start: int) -> list[Job]:
@@ -290,6 +303,7 @@ def _call(
     agent: str | Path | Agent,
     task: Task,
     keywords: Mapping[str, Any],
+    months: int | None,
     scenarios: Sequence[str] | None,
     seeds: Sequence[int],
     start: int,
@@ -297,6 +311,8 @@ def _call(
 ) -> str:
     shown = repr(str(agent)) if isinstance(agent, str | Path) else f"<{agent.name}>"
     arguments: dict[str, Any] = {**keywords, "seeds": list(seeds)}
+    if months is not None:
+        arguments["months"] = months
     if scenarios is not None:
         arguments["scenarios"] = list(scenarios)
     if start:
