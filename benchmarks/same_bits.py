@@ -9,9 +9,11 @@ processes of their own, 24 environments for so many decisions (a twentieth of th
 decisions). After every tenth of the case the two are compared: observations, rewards, ends, and all arrays that an
 environment keeps from step to step, voltages and factors of the power flow included. What a later revision keeps
 besides is not looked at, nor is the sign of a zero in what is kept (sums and products of numbers that agree but for it
-agree but for it, and nothing is divided by zero).
+agree but for it, and nothing is divided by zero). Matrices are compared apart: a revision may keep more entries of
+them, or in another order, and find the same voltages.
 
-It writes ``benchmarks/results/same_bits.json``: grid steps that were compared, and what differed, by case.
+It writes ``benchmarks/results/same_bits.json``: grid steps that were compared, and what differed, by case, and in how
+many cases matrices did.
 """
 
 from __future__ import annotations
@@ -36,6 +38,14 @@ HEURISTICS = {
     "H1": (None, "idle"),
 }
 PLAYS = ("random", "some", "nothing")
+MATRICES = frozenset(
+    f"flow.{name}"
+    for name in (
+        "admittance_first", "admittance_node", "admittance", "admittance_panel", "line_entry", "diagonal_entry",
+        "first_column", "own_column", "first_panel", "own_panel", "column", "panel",
+    )
+)  # fmt: skip
+"""Admittance matrices, Jacobians and their factors, and where their entries are."""
 _PLAY = """
 import hashlib, json, sys, warnings
 import gymnasium, numpy as np
@@ -111,13 +121,14 @@ def play(source: Path, grid: str, steps: int) -> list[dict[str, Any]]:
     return [json.loads(line) for line in output.splitlines() if line.startswith(b"{")]
 
 
-def differences(before: dict[str, Any], now: dict[str, Any]) -> list[str]:
-    """Names of what differs first, with the tenth of the case in which it does."""
+def differences(before: dict[str, Any], now: dict[str, Any]) -> list[tuple[str, int]]:
+    """Names of all that differs, each with the first tenth of the case in which it does."""
+    found: dict[str, int] = {}
     for tenth, (old, new) in enumerate(zip(before["hashes"], now["hashes"], strict=True)):
-        found = [f"{name} in tenth {tenth + 1}" for name, value in old.items() if new.get(name) != value]
-        if found:
-            return found
-    return []
+        for name, value in old.items():
+            if new.get(name) != value:
+                found.setdefault(name, tenth + 1)
+    return list(found.items())
 
 
 def main() -> None:
@@ -133,7 +144,14 @@ def main() -> None:
         for grid in options.grids:
             for before, now in zip(play(old, grid, options.steps), play(ROOT, grid, options.steps), strict=True):
                 differing = differences(before, now)
-                cases.append({"case": now["case"], "n_steps": now["n_steps"], "differing": differing})
+                cases.append(
+                    {
+                        "case": now["case"],
+                        "n_steps": now["n_steps"],
+                        "differing": [f"{name} in tenth {tenth}" for name, tenth in differing if name not in MATRICES],
+                        "matrices_differ": any(name in MATRICES for name, _ in differing),
+                    }
+                )
             done = [case for case in cases if case["case"][0] == grid]
             n_differing = sum(bool(case["differing"]) for case in done)
             print(f"{grid}: {len(done)} cases, {sum(case['n_steps'] for case in done):,} grid steps, "
@@ -143,6 +161,7 @@ def main() -> None:
                 "sources": {"before": before_source, "now": source_hash()},  # as benchmarks/results/parity.json has it
                 "n_steps": sum(case["n_steps"] for case in cases),
                 "n_differing": sum(bool(case["differing"]) for case in cases),
+                "n_matrices_differing": sum(case["matrices_differ"] for case in cases),
                 "cases": cases,
             }
             write_json(RESULTS, result)

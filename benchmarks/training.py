@@ -8,7 +8,7 @@ Each round runs every case in a process of its own, with the package as it is an
 and Grid2Op doing nothing. Cases:
 
 - ``random``: random actions of the task's smallest set, no heuristic, 256 environments, one thread, per second of
-  processor time. A first round that does not count makes the months that are played, in both revisions.
+  processor time. The library is made before, in both revisions; a first round, which compiles, does not count.
 - ``nothing``: doing nothing, 64 environments, one thread.
 - ``first_step``: from the start of a process to the end of the first step of 256 environments, on an empty data folder,
   with compiled code there.
@@ -150,11 +150,10 @@ def seconds_on_empty_folder(source: Path, script: str, *arguments: str) -> float
         return time.perf_counter() - began
 
 
-def make_library(grid_id: str) -> float:
-    """Seconds in which two processes make the library of a grid."""
+def making_library(grid_id: str) -> str:
+    """What makes the months of the library of a grid that are missing, in two processes."""
     command = ["data", "make", grid_id, "--split", "train", "--workers", "2"]
-    code = f"import sys; from rl2grid.cli.main import main; sys.exit(main({command!r}))"
-    return seconds_on_empty_folder(ROOT, code)
+    return f"import sys; from rl2grid.cli.main import main; sys.exit(main({command!r}))"
 
 
 def summary(values: list[float]) -> dict[str, float]:
@@ -181,8 +180,10 @@ def main() -> None:
         for name, (script, *arguments) in cases().items():
             if not is_wanted(name):
                 continue
+            for source in (old, ROOT):
+                output_of(source, making_library(grid_of(arguments[0])))
             rates: dict[str, list[float]] = {"before": [], "now": []}
-            for number in range(options.rounds + 1):  # the first makes what is missing: code, months
+            for number in range(options.rounds + 1):  # the first compiles what is missing
                 for side, source in (("before", old), ("now", ROOT)):
                     rate = run(source, script, *arguments)["decisions_per_s"]
                     if number:
@@ -206,7 +207,8 @@ def main() -> None:
             values = [seconds_on_empty_folder(ROOT, _FIRST_STEP, task) for _ in range(options.rounds)]
             write(result, f"first_step {task}", {"seconds": summary(values)})
         if is_wanted(f"library {grid}"):
-            write(result, f"library {grid}", {"seconds": summary([make_library(grid)])})
+            seconds = seconds_on_empty_folder(ROOT, making_library(grid))
+            write(result, f"library {grid}", {"seconds": summary([seconds])})
 
 
 def write(result: dict[str, Any], name: str, entry: dict[str, Any]) -> None:
