@@ -115,7 +115,7 @@ def test_a_command_asks_for_the_evaluation_that_it_was_made_from(
     assert main(words[1:]) == 2
     (((agent, task), chosen),) = asked
     assert (agent, task.id, chosen["split"]) == ("greedy", "rl2grid/bus14-T0-v0", "test")
-    assert (list(chosen["seeds"]), len(chosen["scenarios"])) == ([0, 1, 2], 2)
+    assert (list(chosen["seeds"]), chosen["months"]) == ([0, 1, 2], 2)
     assert {name: value for name, value in chosen.items() if name in ("heuristic", *NAMES)} == keywords
 
 
