@@ -121,14 +121,14 @@ def play(source: Path, grid: str, steps: int) -> list[dict[str, Any]]:
     return [json.loads(line) for line in output.splitlines() if line.startswith(b"{")]
 
 
-def differences(before: dict[str, Any], now: dict[str, Any]) -> list[tuple[str, int]]:
-    """Names of all that differs, each with the first tenth of the case in which it does."""
+def differences(before: dict[str, Any], now: dict[str, Any]) -> dict[str, int]:
+    """The first tenth of the case in which each array differs, by its name; of those that do."""
     found: dict[str, int] = {}
     for tenth, (old, new) in enumerate(zip(before["hashes"], now["hashes"], strict=True)):
         for name, value in old.items():
             if new.get(name) != value:
                 found.setdefault(name, tenth + 1)
-    return list(found.items())
+    return found
 
 
 def main() -> None:
@@ -143,13 +143,14 @@ def main() -> None:
         before_source = output_of(old, _SOURCE_HASH).decode().split()[-1]
         for grid in options.grids:
             for before, now in zip(play(old, grid, options.steps), play(ROOT, grid, options.steps), strict=True):
-                differing = differences(before, now)
+                found = differences(before, now)
+                others = {name: tenth for name, tenth in found.items() if name not in MATRICES}
                 cases.append(
                     {
                         "case": now["case"],
                         "n_steps": now["n_steps"],
-                        "differing": [f"{name} in tenth {tenth}" for name, tenth in differing if name not in MATRICES],
-                        "matrices_differ": any(name in MATRICES for name, _ in differing),
+                        "differing": [f"{name} in tenth {tenth}" for name, tenth in others.items()],
+                        "matrices_differ": not MATRICES.isdisjoint(found),
                     }
                 )
             done = [case for case in cases if case["case"][0] == grid]

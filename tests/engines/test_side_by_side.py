@@ -98,12 +98,10 @@ def test_rows_that_differ_in_their_open_lines_alone_are_solved_side_by_side(grid
     both = [Played(grid_id, None, together) for together in (True, False)]
     for played in both:
         played.step([switch(2 * i) for i in range(N)])
-    for _ in range(STEPS):
+    for step in range(STEPS):
         for played in both:
             played.step([DO_NOTHING] * N)
-        together, alone = (played.kept() for played in both)
-        for name, values in together.items():
-            np.testing.assert_array_equal(values, alone[name], err_msg=name)
+        assert_kept_the_same(both, step)
     environments = both[0].environments
     lasting = ~environments.state.terminated
     assert lasting.sum() > N // 2
@@ -112,6 +110,12 @@ def test_rows_that_differ_in_their_open_lines_alone_are_solved_side_by_side(grid
     assert DONE in both[0].lane_states
     topologies = environments.flow.topo_vect[environments.lanes.row[environments.lanes.state == DONE]]
     assert len(np.unique(topologies, axis=0)) > 1, "lanes of the last step had different topologies"
+
+
+def assert_kept_the_same(both: list[Played], step: int) -> None:
+    together, alone = (played.kept() for played in both)
+    for name, values in together.items():
+        np.testing.assert_array_equal(values, alone[name], err_msg=f"{name} after {step + 1} steps")
 
 
 def play_both(both: list[Played], actions: Sequence[StepAction], share: float) -> None:
@@ -125,9 +129,7 @@ def play_both(both: list[Played], actions: Sequence[StepAction], share: float) -
         chosen = [actions[random.integers(len(actions))] if random.random() < share else DO_NOTHING for _ in range(N)]
         for played in both:
             played.step(chosen)
-        together, alone = (played.kept() for played in both)
-        for name, values in together.items():
-            np.testing.assert_array_equal(values, alone[name], err_msg=f"{name} after {step + 1} steps")
+        assert_kept_the_same(both, step)
         state = both[0].environments.state
         for i in np.flatnonzero(state.terminated | state.truncated).tolist():
             numbers[i] += 1

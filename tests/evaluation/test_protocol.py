@@ -339,6 +339,14 @@ def test_what_an_agent_refuses_is_known_before_months_are_made(monkeypatch):
         evaluate("recovery", "bus14-R")
 
 
+def test_what_is_asked_before_months_are_made_does_not_hinder_workers(monkeypatch):
+    asked = {"scenarios": list_scenarios("bus14", "validation")[:1], "episode_length": 5}
+    expected = evaluate("planner", "bus14-T0", **asked)
+    monkeypatch.setattr(evaluation, "make_scenarios", lambda *request: (iter((0, 1)), 1))
+    played = evaluate("planner", "bus14-T0", **asked, workers=1)
+    assert played.summary.survival == expected.summary.survival
+
+
 def test_the_first_months_of_a_split_are_played():
     played = evaluate("do-nothing", "bus14-T0", months=2)
     assert tuple(episode.scenario for episode in played.episodes) == list_scenarios("bus14", "validation")[:2]

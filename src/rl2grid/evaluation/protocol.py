@@ -11,6 +11,8 @@ on the number of workers nor on interruptions.
 
 from __future__ import annotations
 
+import copy
+import itertools
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
@@ -104,9 +106,11 @@ def evaluate(
         check_folder(output)  # before months are made, which takes minutes
     # The agent whose identity is stored, not its path: a run that still trains replaces the file.
     setting = Setting(task.id, chosen, keywords)
-    if not _are_made(task.grid_id, chosen_scenarios):
-        setting.player().close()  # what the agent refuses, likewise
-    watch_making(task.grid_id, *make_scenarios(task.grid_id, chosen_scenarios), progress)
+    made, total = make_scenarios(task.grid_id, chosen_scenarios)
+    there = next(made)
+    if there < total:  # what the agent refuses, likewise; workers are sent the agent, which is not to be bound then
+        (copy.deepcopy(setting) if processes else setting).player().close()
+    watch_making(task.grid_id, itertools.chain((there,), made), total, progress)
     return run_evaluation(
         setting,
         jobs,
@@ -254,12 +258,6 @@ def _check_lengths(task: Task, scenarios: Sequence[str], start: int, episode_len
         check_length(
             scenario, MAX_STEPS if whole else load_scenario(task.grid_id, scenario).n_steps, episode_length, start
         )
-
-
-def _are_made(grid_id: str, scenarios: Sequence[str]) -> bool:
-    """Whether all months are there."""
-    made, total = make_scenarios(grid_id, scenarios)
-    return next(made) == total
 
 
 def _jobs(scenarios: Sequence[str], seeds: Sequence[int], start: int) -> list[Job]:
