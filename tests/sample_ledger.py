@@ -12,8 +12,8 @@ from rl2grid.records.ledger import HashedTest, hashed_test
 MONTHS = {"split": "test", "split_version": "2", "generator_version": "1"}
 
 
-def untrained(agent: str, survivals: list[float]) -> HashedTest:
-    configuration = {"agent": agent, "task": TASK, "heuristic": None}
+def untrained(agent: str, survivals: list[float], rules: int = 1) -> HashedTest:
+    configuration = {"agent": agent, "task": TASK, "heuristic": None} | ({"rules": rules} if rules > 1 else {})
     return hashed_test(configuration, {}, result(agent, [[one] for one in survivals], **MONTHS))
 
 

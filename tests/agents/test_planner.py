@@ -115,7 +115,7 @@ def test_brought_back_it_plans_anew_and_knows_nothing_of_what_it_saw_later():
     observation, info = env.unwrapped.restore(world)
     again = agent.act(observation, info)
     assert agent._dispatch is not None
-    assert max(step for step, _ in agent._dispatch._history) == info["step"]
+    assert max(seen.step for seen in agent._dispatch._history) == info["step"]
     env.unwrapped.restore(world)
     asked_twice = agent.act(observation, info)
     np.testing.assert_array_equal(again["injection"], asked_twice["injection"])
@@ -135,6 +135,24 @@ def test_curtailment_stays_as_it_is_while_nothing_is_planned():
     action = agent._held()
     env.step(action)
     np.testing.assert_allclose(state.curtailment_limit[0], kept, atol=1e-6)
+
+
+def test_what_was_asked_for_and_not_reached_is_given_up_while_nothing_is_planned():
+    """So that nothing is solved again, and a series that rises too fast for its generators ends nothing."""
+    env = environment("bus14-R")
+    agent = Planner()
+    agent.bind(env)
+    env.reset(seed=0, options={"start": 140})
+    agent.reset(0)
+    request = np.zeros(env.action_space.shape, np.float32)
+    request[0] = 1.0
+    env.step(request)
+    state = env.unwrapped.state
+    assert np.abs(state.actual_dispatch[0] - state.target_dispatch[0]).max() > 0.01
+    dispatched = state.actual_dispatch[0].copy()
+    env.step(agent._held())
+    np.testing.assert_allclose(state.target_dispatch[0], dispatched, atol=1e-5)
+    np.testing.assert_array_equal(state.actual_dispatch[0], dispatched)
 
 
 def test_it_says_why():

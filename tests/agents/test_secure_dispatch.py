@@ -165,3 +165,51 @@ def test_a_plan_counts_only_what_the_forecast_says_of_the_next_step():
         plans.append(dispatch.plan(env.state, point, series_of(env, dispatch), contingencies, everything=True))
     assert plans[0] is not None
     np.testing.assert_array_equal(plans[0], plans[1])
+
+
+def rising(env, series, megawatts):
+    """The series, where by the trend one generator far from the balancing one produces so much more in a step."""
+    layout = continuous_layout(env.grid)
+    trend = np.zeros(env.grid.dim_topo)
+    trend[env.grid.gen_pos_topo_vect[layout.curtail[0]]] = megawatts
+    return series._replace(trend=trend)
+
+
+def test_a_line_that_will_be_overloaded_by_the_trend_is_relieved_before():
+    env = standing("bus36-MO-v0-R", opponent=False)
+    dispatch = dispatch_of(env)
+    point, series = snapshot_of(env.engine, 0), series_of(env, dispatch)
+    assert dispatch.worst_loading(env.state, point, series) < 0.9
+    assert not dispatch.is_pressed(env.state, point, series)
+    assert dispatch.plan(env.state, point, series, NONE, everything=False) is None
+    later = rising(env, series, 40.0)
+    assert dispatch.is_pressed(env.state, point, later)
+    planned = dispatch.plan(env.state, point, later, NONE, everything=False)
+    assert planned is not None
+    before, _ = dispatch._cases(env.state, point, later, NONE)
+    worst = int(np.argmax(np.abs(before[1].share)))
+    change = before[1].effect[worst] @ (planned - controls(env.state, env.grid).now)
+    assert np.sign(before[1].share[worst]) * change < 0  # what will flow too much is made less
+
+
+def test_what_curtailment_holds_makes_the_next_step_count():
+    env = standing("bus36-MO-v0-R", opponent=False)
+    dispatch, layout = dispatch_of(env), continuous_layout(env.grid)
+    point, series = snapshot_of(env.engine, 0), series_of(env, dispatch)
+    env.state.gen_p_before_curtail[0][layout.curtail] = env.state.gen_p[0][layout.curtail] + 5.0
+    assert dispatch.is_pressed(env.state, point, series)
+
+
+def test_the_trend_is_of_what_nobody_dispatched_or_curtailed():
+    env = standing("bus14-R")
+    dispatch, layout, state = dispatch_of(env), continuous_layout(env.grid), env.state
+    gen, renewable = int(layout.redispatch[0]), int(layout.curtail[0])
+    for step, made, available, load in ((4, 40.0, 20.0, 10.0), (8, 48.0, 28.0, 14.0)):
+        state.step[0] = step
+        state.gen_p[0][gen], state.actual_dispatch[0][gen] = made + 7.0 * step, 7.0 * step
+        state.gen_p[0][renewable], state.gen_p_before_curtail[0][renewable] = 1.0, available
+        state.load_p[0][0] = load
+        dispatch.watch(state)
+    trend = dispatch.foreseen(state, np.zeros((1, env.grid.n_gen), np.float32)).trend
+    positions = [env.grid.gen_pos_topo_vect[[gen, renewable]], env.grid.load_pos_topo_vect[[0]]]
+    np.testing.assert_allclose(trend[np.concatenate(positions)], [2.0, 2.0, -1.0])

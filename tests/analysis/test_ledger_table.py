@@ -9,7 +9,8 @@ from sample_ledger import MONTHS, ledger, trained, untrained
 from sample_results import TASK, result
 
 from rl2grid.analysis.ledger_figure import draw_ledger
-from rl2grid.analysis.ledger_table import LEGEND, ledger_table
+from rl2grid.analysis.ledger_overview import overview_table
+from rl2grid.analysis.ledger_table import LEGEND, ledger_table, short_ledger_table
 from rl2grid.errors import UsageError
 from rl2grid.records.ledger import hashed_test, read_ledger
 
@@ -62,6 +63,20 @@ def test_what_cannot_be_compared_is_marked():
     assert sorted(rows) == ["", "a1 b", "a2 s t"]
     to_ppo = ledger_table(results, TASK, "ppo + idle")
     assert to_ppo.count("other budget") >= 1
+
+
+def test_what_later_rules_of_an_agent_replaced_is_marked_and_left_out_of_short_tables():
+    results = ledger(
+        untrained("do-nothing", [0.1, 0.2]), untrained("planner", [0.7, 0.8]), untrained("planner", [0.6, 0.8], rules=2)
+    )
+    marks = [line.split("|")[-2].strip() for line in ledger_table(results).splitlines() if "| planner |" in line]
+    assert sorted(marks) == ["a1", "r"]
+    short = short_ledger_table(results, TASK)
+    assert short.count("planner") == 1
+    assert "0.700 [" in short
+    (axes,) = draw_ledger(results, TASK).axes
+    assert len(axes.get_yticklabels()) == 2
+    assert "**0.700** (2 months)" in overview_table(results)
 
 
 def test_an_unknown_reference_is_refused():

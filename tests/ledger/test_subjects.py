@@ -16,6 +16,7 @@ from rl2grid.envs.tasks import Task
 from rl2grid.errors import UsageError
 from rl2grid.ledger import subjects
 from rl2grid.ledger.subjects import find_subject, play_test
+from rl2grid.records.evaluations import identity_hash
 from rl2grid.records.ledger import agent_of, choice_hash, read_ledger
 from rl2grid.records.looks import budget
 from rl2grid.records.versions import TARGETS_VERSION
@@ -35,6 +36,15 @@ def played(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
 
     monkeypatch.setattr(subjects, "evaluate", evaluate)
     return asked
+
+
+def test_an_agent_whose_rules_changed_says_so_where_they_did():
+    assert find_subject("planner@bus14-R:recovery").configuration["rules"] == 2
+    assert find_subject("planner@bus14-H0").digest != identity_hash(
+        {name: value for name, value in find_subject("planner@bus14-H0").configuration.items() if name != "rules"}
+    )
+    assert "rules" not in find_subject("planner@bus14-T0").configuration
+    assert "rules" not in find_subject("do-nothing@bus14-R").configuration
 
 
 def test_an_agent_without_training_is_named_with_its_task(played):

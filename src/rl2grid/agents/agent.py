@@ -59,6 +59,14 @@ class SpecialisedAgent(Protocol):
     """``"T"``: topology tasks, ``"R"``: redispatching tasks, ``"H"``: joint tasks; ``bind`` refuses the others."""
 
 
+@runtime_checkable
+class RevisedAgent(Protocol):
+    """An agent that plays otherwise than it did in its first results, which a ledger keeps apart."""
+
+    rules: Mapping[str, int]
+    """Version of its rules by kind of task, as in ``kinds``, where it is not the first."""
+
+
 class Considered(NamedTuple):
     """What an agent thought of actions when it acted."""
 

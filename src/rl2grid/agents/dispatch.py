@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
 import gymnasium
@@ -25,6 +26,10 @@ _NEGLIGIBLE = 0.01
 """MW of dispatch, curtailment or storage that is as good as none."""
 
 
+REQUESTS_COUNTED = {"R": 2, "H": 2}
+"""Second rules of all that dispatch: the first request to a generator is added to what it was given to balance."""
+
+
 class Control(NamedTuple):
     """Something that injects power: how much it injects now, may inject in the next step, and what that costs."""
 
@@ -39,6 +44,7 @@ class DispatchAgent:
     """What agents that plan redispatch on the DC flow have in common: the grid and its electrical model."""
 
     kinds = ("R", "H")
+    rules: ClassVar[Mapping[str, int]] = REQUESTS_COUNTED
     refusal: ClassVar[str]
     """What is said of tasks without continuous actions."""
 
@@ -78,12 +84,12 @@ def controls(state: GridState, grid: Grid) -> Control:
     """
     layout = continuous_layout(grid)
     gens, renewables, units = layout.redispatch, layout.curtail, layout.storage
-    dispatch, target = (x[0][gens].astype(np.float64) for x in (state.actual_dispatch, state.target_dispatch))
+    dispatch, base = state.actual_dispatch[0][gens].astype(np.float64), requested_from(state, gens)
     up = np.minimum(state.gen_max_ramp_up[gens], state.gen_margin_up[0][gens])
     down = np.minimum(state.gen_max_ramp_down[gens], state.gen_margin_down[0][gens])
     reach = (state.gen_pmax - state.gen_pmin)[gens]
-    least = np.maximum.reduce([dispatch - down, target - state.gen_max_ramp_down[gens], -reach])
-    most = np.minimum.reduce([dispatch + up, target + state.gen_max_ramp_up[gens], reach])
+    least = np.maximum.reduce([dispatch - down, base - state.gen_max_ramp_down[gens], -reach])
+    most = np.minimum.reduce([dispatch + up, base + state.gen_max_ramp_up[gens], reach])
     available = np.maximum(state.gen_p_before_curtail[0], state.gen_p[0])[renewables].astype(np.float64)
     curtailed = state.gen_p[0][renewables] - available
     charge = state.storage_charge[0].astype(np.float64)
@@ -112,12 +118,22 @@ def controls(state: GridState, grid: Grid) -> Control:
     )
 
 
+def requested_from(state: GridState, gens: NDArray[np.int32]) -> F64:
+    """What a request to each generator is added to, MW, float64 [gen]: its target.
+
+    The first one is added to what the generator was given to balance others: it has no target yet, which shows as 0.
+    """
+    target, actual = (x[0][gens].astype(np.float64) for x in (state.target_dispatch, state.actual_dispatch))
+    base: F64 = np.where(target == 0.0, actual, target)
+    return base
+
+
 def encode(state: GridState, grid: Grid, planned: F64) -> NDArray[np.float32]:
     """The continuous action that asks for what :func:`optimal_injections` planned, float32 [continuous]."""
     layout = continuous_layout(grid)
     gens, renewables = layout.redispatch, layout.curtail
     dispatch, curtailed, delivered = np.split(planned, [len(gens), len(gens) + len(renewables)])
-    request = dispatch - state.target_dispatch[0][gens]
+    request = dispatch - requested_from(state, gens)
     ramp = np.where(request > 0, state.gen_max_ramp_up[gens], state.gen_max_ramp_down[gens])
     moves = np.divide(request, ramp, out=np.zeros(len(gens)), where=ramp > 0)
     available = np.maximum(state.gen_p_before_curtail[0], state.gen_p[0])[renewables]

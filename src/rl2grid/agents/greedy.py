@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 import gymnasium
 
 from rl2grid.agents.agent import Action, Agent, Considered, ExplainingAgent, Info, Observation, RankingAgent
+from rl2grid.agents.dispatch import REQUESTS_COUNTED
 from rl2grid.agents.greedy_dispatch import GreedyDispatch
 from rl2grid.agents.greedy_joint import GreedyJoint
 from rl2grid.agents.greedy_topology import GreedyTopology
@@ -26,6 +27,7 @@ class Greedy:
     """
 
     name = "greedy"
+    rules: ClassVar[Mapping[str, int]] = REQUESTS_COUNTED
 
     def __init__(self, actions: Sequence[int] | None = None) -> None:
         self._actions = actions

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from numbers import Real
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -49,10 +49,12 @@ _LEAST_AGE = 2
 """Steps that a plan is followed at least, however the dispatch drifts."""
 _SHARES = (1.0, 0.5, 0.2)
 """Of a plan that the generators could not follow: what is tried of it."""
+_SETTLED = 5e-3
+"""MW between target and actual dispatch below which it counts as met."""
+_FIRST_REQUEST = 1e-5
+"""MW that count as a request and change nothing."""
 _NEGLIGIBLE_PLAN, _NEGLIGIBLE_REQUEST = 0.05, 0.01
 """MW, and entries of an action, below which a plan changes nothing."""
-_STORING = 0.1
-"""MW of a storage unit in use."""
 
 
 class _Moment(NamedTuple):
@@ -61,6 +63,7 @@ class _Moment(NamedTuple):
     state: GridState
     safe: bool
     ahead: Snapshot | None  # forecast of the next step before anybody acts; None: the generators cannot follow
+    series: Series | None  # of the generators; None where nothing is injected
 
 
 class Planner:
@@ -83,6 +86,7 @@ class Planner:
     """
 
     kinds = ("T", "R", "H")
+    rules: ClassVar[Mapping[str, int]] = {"R": 2, "H": 2}
 
     def __init__(self, without: Collection[str] = (), seconds: float | None = None) -> None:
         if isinstance(without, str) or not isinstance(without, Collection):
@@ -176,12 +180,17 @@ class Planner:
             self._is_plan_void |= topology_part(played) != self._topology
 
     def _moment(self, state: GridState) -> _Moment:
-        return _Moment(state, is_safe(self._opened(state), 0), forecast_of(self._env.engine, 0))
+        series = None if self._dispatch is None else self._series(state)
+        return _Moment(state, is_safe(self._opened(state), 0), forecast_of(self._env.engine, 0), series)
 
     def _is_calm(self, moment: _Moment) -> bool:
         """Whether nothing has to be done by the forecast."""
-        if moment.ahead is None or self._search is None:
+        if moment.ahead is None:
             return True
+        if self._search is None:
+            assert self._dispatch is not None
+            assert moment.series is not None
+            return self._dispatch.worst_loading(moment.state, moment.ahead, moment.series) < SAFE
         outcomes, _ = self._search.outcomes(moment.ahead, np.zeros(1, np.int32))
         return bool(outcomes.worst_loading[NOTHING] < SAFE)
 
@@ -223,24 +232,25 @@ class Planner:
     def _preventive(self, moment: _Moment, topology: int) -> F32 | None:
         """The injection that a safe grid is to have, every half hour and whenever the dispatch drifts."""
         assert self._dispatch is not None
-        state = moment.state
-        due = int(state.step[0]) % _PERIOD == 0 or topology != NOTHING
-        due = due or np.abs(state.storage_power[0]).max(initial=0.0) > _STORING or self._is_plan_void
+        assert moment.series is not None
+        state, series = moment.state, moment.series
+        point = moment.ahead if moment.ahead is not None else snapshot_of(self._env.engine, 0)
+        pressed = self._dispatch.is_pressed(state, point, series)
+        due = int(state.step[0]) % _PERIOD == 0 or topology != NOTHING or pressed or self._is_plan_void
         self._age += 1
-        if due or (self._age >= _LEAST_AGE and self._drifts(state)):
+        if due or (self._age >= _LEAST_AGE and self._drifts(state, series)):
             self._age, self._is_plan_void = 0, False
-            point = snapshot_of(self._env.engine, 0)
-            self._planned = self._plan(moment, point, topology, self._series(state), _PERIOD)
+            self._planned = self._plan(moment, point, topology, series, 1 if pressed else _PERIOD)
         return None if self._planned is None else self._towards(topology, self._planned)
 
-    def _drifts(self, state: GridState) -> bool:
+    def _drifts(self, state: GridState, series: Series) -> bool:
         assert self._dispatch is not None
-        return self._dispatch.is_in_use(state) and self._dispatch.is_drifting(state, self._series(state))
+        return self._dispatch.is_in_use(state) and self._dispatch.is_drifting(state, series)
 
     def _relieve(self, moment: _Moment) -> Action:
         """What makes the grid safe again."""
         point = moment.ahead if moment.ahead is not None else snapshot_of(self._env.engine, 0)
-        series = None if self._dispatch is None else self._series(moment.state)
+        series = moment.series
         if self._search is None:
             assert series is not None
             injection = self._injection(moment, point, NOTHING, series)
@@ -312,8 +322,9 @@ class Planner:
 
     def _followed(self, topology: int, action: F32) -> F32 | None:
         """As much of an action as generators can follow by the forecast."""
+        held = self._held()
         for share in _SHARES:
-            part = (action * np.float32(share)).astype(np.float32)
+            part = (held + np.float32(share) * (action - held)).astype(np.float32)
             result = self._env.simulate(self._action(topology, part))
             if not result.terminated and not result.info["illegal"]:
                 return part
@@ -324,10 +335,21 @@ class Planner:
         return worst_loading(self._env, self._action(topology, injection))
 
     def _held(self) -> F32:
-        """The injection that leaves dispatch and curtailment as they are."""
-        layout = continuous_layout(self._grid)
-        values, n_gen = np.zeros(layout.size, np.float32), len(layout.redispatch)
-        limits = self._env.state.curtailment_limit[0][layout.curtail]
+        """The injection that leaves dispatch and curtailment as they are.
+
+        What was asked for and not reached is given up: while targets are met nothing is solved again, so that a series
+        that rises faster than its generators can, as some do, ends nothing.
+        """
+        layout, state = continuous_layout(self._grid), self._env.state
+        gens, n_gen = layout.redispatch, len(layout.redispatch)
+        values = np.zeros(layout.size, np.float32)
+        ramp, target = state.gen_max_ramp_up[gens], state.target_dispatch[0][gens]
+        missed = state.actual_dispatch[0][gens] - target
+        # Who was never asked has no target, and the first request is added to what it was given.
+        request = np.where(target == 0.0, _FIRST_REQUEST, missed)
+        request[np.abs(missed) < _SETTLED] = 0.0
+        values[:n_gen] = np.clip(np.divide(request, ramp, out=np.zeros_like(missed), where=ramp > 0), -1.0, 1.0)
+        limits = state.curtailment_limit[0][layout.curtail]
         values[n_gen : n_gen + len(layout.curtail)] = np.minimum(limits - 1.0, 0.0)
         return values
 

@@ -41,8 +41,13 @@ _CASES = 8
 """Outages in a programme at most."""
 _WATCHED = 0.85
 """Loading from which on a line of a case has a row."""
-_NORMAL_WEIGHT = 20.0
-"""Price of the overload of a line, as a share of its limit, as the grid is; after an outage: the outage's weight."""
+_NORMAL_WEIGHT, _LATER_WEIGHT = 20.0, 5.0
+"""Price of the overload of a line, as a share of its limit, as the grid is, and as it will be by the trend; after an
+outage: the outage's weight."""
+_LATER = 6
+"""Steps ahead at which the grid is watched as well, by the trend."""
+_TREND_SHARE = 0.75
+"""Of a trend that is expected to go on: flows six steps later are met best with it."""
 _PRICE = 2e-4
 """Of a MW of the cheapest control away from rest."""
 _LIMIT_PRICE = 1.0
@@ -83,11 +88,35 @@ class _Case(NamedTuple):
     effect: F64  # [line, control] change of that per MW
 
 
+class _Look(NamedTuple):
+    """An operating point, as the grid is then and as the trend leaves it."""
+
+    dc: DcPoint
+    bus: I32  # [topo]
+    table: F64  # [line, bus] sensitivities
+    flow: F64  # [line] MW by the DC flow
+    effect: F64  # [line, control] MW more on a line per MW injected
+    worst: float  # loading by the AC flow
+    present: _Case
+    later: _Case
+
+    @property
+    def worst_later(self) -> float:
+        """The largest loading of the grid as it is, and by the trend."""
+        return max(self.worst, float(np.abs(self.later.share).max()))
+
+
 class Series(NamedTuple):
-    """Production of the redispatchable generators before any dispatch."""
+    """Production of the redispatchable generators before any dispatch, and how all injections change."""
 
     now: F64  # [gen] MW
     ahead: F64  # [horizon, gen] MW
+    trend: F64  # [topo] MW more injected by each element in a step, by the last half hour
+
+
+class _Seen(NamedTuple):
+    step: int
+    injection: F64  # [topo] MW, as if nothing were dispatched, curtailed or stored
 
 
 class SecureDispatch:
@@ -103,12 +132,14 @@ class SecureDispatch:
         self._grid, self._network, self._what_if = grid, network, what_if
         self._layout = continuous_layout(grid)
         self._positions = control_positions(grid)
-        self._history: list[tuple[int, F64]] = []
-        self._tables: dict[bytes, F64] = {}
+        self._history: list[_Seen] = []
+        self._tables: dict[bytes, F64 | None] = {}
+        self._looked: tuple[Snapshot, Series, _Look | None] | None = None
 
     def reset(self) -> None:
         """Forget the series of the last episode."""
         self._history.clear()
+        self._looked = None
 
     def watch(self, state: GridState) -> None:
         """Remember what the generators produce by the series.
@@ -116,8 +147,8 @@ class SecureDispatch:
         Who was brought back to an earlier moment, or is asked twice, forgets what was seen from there on.
         """
         step = int(state.step[0])
-        before = [moment for moment in self._history if step - _TREND <= moment[0] < step]
-        self._history = [*before, (step, self._series_now(state))]
+        before = [seen for seen in self._history if step - _TREND <= seen.step < step]
+        self._history = [*before, _Seen(step, self._undispatched(state))]
 
     def foreseen(self, state: GridState, forecast: F32) -> Series:
         """The series of the redispatchable generators, now and at the horizons of the programme.
@@ -128,21 +159,34 @@ class SecureDispatch:
                 of the last half hour.
         """
         now, gens = self._series_now(state), self._layout.redispatch
-        trend = np.zeros(len(gens))
-        if len(self._history) > 1:
-            (first, before), (last, after) = self._history[0], self._history[-1]
-            trend = (after - before) / (last - first)
+        all_trends = self._trend()
+        trend = all_trends[self._grid.gen_pos_topo_vect[gens]]
         known = forecast[:, gens].astype(np.float64)
         least, most = np.minimum(state.gen_pmin[gens], now), np.maximum(state.gen_pmax[gens], now)
         ahead = [
             known[steps - 1] if steps <= len(known) else np.clip(known[-1] + (steps - len(known)) * trend, least, most)
             for steps in _HORIZONS
         ]
-        return Series(now, np.array(ahead))
+        return Series(now, np.array(ahead), all_trends)
 
     def is_in_use(self, state: GridState) -> bool:
         """Whether generators are dispatched by more than a trifle."""
         return bool(np.abs(state.actual_dispatch[0]).max(initial=0.0) >= _TRIFLE)
+
+    def worst_loading(self, state: GridState, point: Snapshot, series: Series) -> float:
+        """The largest loading of an operating point; infinite where the flow has no solution."""
+        look = self._look(state, point, series)
+        return np.inf if look is None else look.worst
+
+    def is_pressed(self, state: GridState, point: Snapshot, series: Series) -> bool:
+        """Whether the next step counts more than where generators get in many.
+
+        Curtailment or storage holds what generators are to take over, or by the trend a line will be loaded too much.
+        """
+        control = controls(state, self._grid)
+        held = np.abs(control.now[len(self._layout.redispatch) :]).max(initial=0.0)
+        look = self._look(state, point, series)
+        return bool(held > _AWAY or (look is not None and look.worst_later > NORMAL_BOUND))
 
     def is_drifting(self, state: GridState, series: Series) -> bool:
         """Whether the dispatch would leave what generators can do in the next hour, if it stayed as it is.
@@ -184,7 +228,7 @@ class SecureDispatch:
             steps: that the generators have to get there; see :meth:`next_step`.
         """
         control = self._allowed(state, controls(state, self._grid), everything, steps)
-        cases, needed = self._cases(state, point, contingencies)
+        cases, needed = self._cases(state, point, series, contingencies)
         away = np.abs(control.now - control.at_rest).max(initial=0.0) > _AWAY
         away = away or np.abs(state.target_dispatch[0]).max(initial=0.0) > _AWAY
         if not needed and not away:
@@ -205,6 +249,21 @@ class SecureDispatch:
         if abs(total) > abs(excess):
             change[:n_gen][waiting] *= 1.0 - excess / total
         return control.now + change
+
+    def _undispatched(self, state: GridState) -> F64:
+        dispatched = state.gen_p[0] - state.actual_dispatch[0]
+        produced = np.where(state.gen_renewable, state.gen_p_before_curtail[0], dispatched)
+        injection = np.zeros(self._grid.dim_topo)
+        injection[self._grid.gen_pos_topo_vect] = produced
+        injection[self._grid.load_pos_topo_vect] = -state.load_p[0].astype(np.float64)
+        return injection
+
+    def _trend(self) -> F64:
+        """MW more that every element injects in a step, float64 [topo]; zeros where no past is known."""
+        if len(self._history) < 2:
+            return np.zeros(self._grid.dim_topo)
+        first, last = self._history[0], self._history[-1]
+        return (last.injection - first.injection) / (last.step - first.step)
 
     def _series_now(self, state: GridState) -> F64:
         gens = self._layout.redispatch
@@ -247,41 +306,59 @@ class SecureDispatch:
         most = np.maximum(state.gen_pmax[gens] - all_series.max(axis=0), 0.0)
         return least, most
 
-    def _cases(self, state: GridState, point: Snapshot, contingencies: Contingencies) -> tuple[list[_Case], bool]:
+    def _cases(
+        self, state: GridState, point: Snapshot, series: Series, contingencies: Contingencies
+    ) -> tuple[list[_Case], bool]:
         """What the programme watches, and whether anything of it is loaded too much."""
+        look = self._look(state, point, series)
+        if look is None:
+            return [], False
+        after = self._outages(look, point, contingencies)
+        needed = look.worst_later > NORMAL_BOUND or any(worst > OUTAGE_BOUND for worst, _ in after)
+        return [look.present, look.later, *(case for _, case in after)], needed
+
+    def _look(self, state: GridState, point: Snapshot, series: Series) -> _Look | None:
+        """What is seen of an operating point; None where it has no flow. The last one is remembered."""
+        if self._looked is None or self._looked[0] is not point or self._looked[1] is not series:
+            self._looked = point, series, self._look_at(state, point, series)
+        return self._looked[2]
+
+    def _look_at(self, state: GridState, point: Snapshot, series: Series) -> _Look | None:
         rho = np.zeros((1, self._grid.n_line), np.float32)
         outcome = self._what_if.actions(point, _NO_ACTION, None, rho)
-        if outcome.verdict[0] != 0 or not is_connected(self._grid, point.topo_vect):
-            return [], False
+        if outcome.verdict[0] != 0:
+            return None
         injection = injections(self._grid, point.gen_p, point.load_p, point.storage_p)
         dc = dc_point(state, 0, self._grid, self._network)._replace(busbar=point.topo_vect, injection=injection)
         table = self._sensitivities(dc)
+        if table is None:
+            return None
         bus, flow = buses(self._grid, dc.busbar), flow_by(table, self._grid, dc)
-        effect = table[:, bus[self._positions]]
-        cases = [_case(_NORMAL_WEIGHT, NORMAL_BOUND, flow, effect, rho[0], dc)]
-        after = self._outages(dc, bus, table, flow, effect, point, contingencies)
-        needed = float(rho.max()) > NORMAL_BOUND or any(worst > OUTAGE_BOUND for worst, _ in after)
-        return cases + [case for _, case in after], needed
+        effect, limit = table[:, bus[self._positions]], _limits(flow, rho[0], dc)
+        present = _case(_NORMAL_WEIGHT, NORMAL_BOUND, flow, effect, limit)
+        change = flow_by(table, self._grid, dc._replace(injection=self._to_come(state, series)))
+        later = _case(_LATER_WEIGHT, NORMAL_BOUND, flow + change, effect, limit)
+        return _Look(dc, bus, table, flow, effect, float(rho.max()), present, later)
 
-    def _sensitivities(self, dc: DcPoint) -> F64:
-        """Those of the topology, which seldom changes."""
+    def _to_come(self, state: GridState, series: Series) -> F64:
+        """MW more that every element will inject some steps later; what is curtailed does not follow its series."""
+        change = _LATER * _TREND_SHARE * series.trend
+        curtailed = state.gen_renewable & (state.gen_p_before_curtail[0] - state.gen_p[0] > _AWAY)
+        change[self._grid.gen_pos_topo_vect[curtailed]] = 0.0
+        change[self._grid.gen_pos_topo_vect[self._grid.slack_gen]] -= change.sum()
+        return change
+
+    def _sensitivities(self, dc: DcPoint) -> F64 | None:
+        """Those of the topology, which seldom changes; None where the grid falls apart."""
         key = dc.busbar.tobytes()
         if key not in self._tables:
             while len(self._tables) >= _TABLES:
                 del self._tables[next(iter(self._tables))]
-            self._tables[key] = sensitivities(self._grid, dc)
+            connected = is_connected(self._grid, dc.busbar)
+            self._tables[key] = sensitivities(self._grid, dc) if connected else None
         return self._tables[key]
 
-    def _outages(
-        self,
-        dc: DcPoint,
-        bus: I32,
-        table: F64,
-        flow: F64,
-        effect: F64,
-        point: Snapshot,
-        contingencies: Contingencies,
-    ) -> list[tuple[float, _Case]]:
+    def _outages(self, look: _Look, point: Snapshot, contingencies: Contingencies) -> list[tuple[float, _Case]]:
         """The worst loading after each outage that matters, and its case: flows change by outage factors."""
         lines, grid = contingencies.lines, self._grid
         if len(lines) == 0:
@@ -294,17 +371,13 @@ class SecureDispatch:
         found = []
         for k in order[matters[order]].tolist():
             line = int(lines[k])
-            factor = outage_factors(grid, table, bus, line)
+            factor = outage_factors(grid, look.table, look.bus, line)
             if factor is None:
                 continue
-            case = _case(
-                float(contingencies.weight[k]),
-                OUTAGE_BOUND,
-                flow + factor * flow[line],
-                effect + np.outer(factor, effect[line]),
-                rho[k],
-                dc,
-            )
+            after = look.flow + factor * look.flow[line]
+            effect_after = look.effect + np.outer(factor, look.effect[line])
+            limit = _limits(after, rho[k], look.dc)
+            case = _case(float(contingencies.weight[k]), OUTAGE_BOUND, after, effect_after, limit)
             found.append((float(worst[k]), case))
         return found
 
@@ -363,12 +436,17 @@ class SecureDispatch:
                 )
 
 
-def _case(weight: float, bound: float, flow: F64, effect: F64, rho: NDArray[np.float32], dc: DcPoint) -> _Case:
-    """A case in shares of the limits, which are those with which the DC flow meets the loadings of the AC flow."""
+def _case(weight: float, bound: float, flow: F64, effect: F64, limit: F64) -> _Case:
+    """A case in shares of the limits."""
+    return _Case(weight, bound, flow / limit, effect / limit[:, None])
+
+
+def _limits(flow: F64, rho: NDArray[np.float32], dc: DcPoint) -> F64:
+    """The limits, MW, with which the DC flow meets the loadings of the AC flow, float64 [line]."""
     known = (rho > _LEAST_LOADING) & (np.abs(flow) > 1e-3)
     limit = np.where(known, np.abs(flow) / np.maximum(rho, 0.05), dc.limit)
-    limit = np.clip(limit, _LEAST_SHARE * dc.limit, _MOST_SHARE * dc.limit)
-    return _Case(weight, bound, flow / limit, effect / limit[:, None])
+    met: F64 = np.clip(limit, _LEAST_SHARE * dc.limit, _MOST_SHARE * dc.limit)
+    return met
 
 
 def _overload_rows(case: _Case, now: F64) -> tuple[F64, F64, F64]:

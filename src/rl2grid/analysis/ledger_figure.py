@@ -14,6 +14,7 @@ from rl2grid.analysis.ledger_table import LedgerRow, ledger_rows
 from rl2grid.drawing.theme import LIGHT, Theme, style
 from rl2grid.envs.tasks import short_id
 from rl2grid.records.ledger import HashedTest
+from rl2grid.records.looks import by_present_rules
 from rl2grid.records.statistics import estimate
 
 
@@ -28,7 +29,8 @@ def draw_ledger(results: Mapping[str, HashedTest], task: str, *, theme: Theme = 
     Raises:
         ValueError: the ledger has no result of the task.
     """
-    rows = ledger_rows({digest: one for digest, one in results.items() if one.task == task}, results)
+    current = by_present_rules(results)
+    rows = ledger_rows({digest: one for digest, one in current.items() if one.task == task}, results)
     if not rows:
         raise ValueError(f"The ledger has no result of {task}.")
     found = sorted(((estimate(row.scores("survival")), row) for row in rows), key=lambda one: one[0].value)

@@ -8,6 +8,7 @@ from rl2grid.analysis.ledger_table import LedgerRow, ledger_rows
 from rl2grid.analysis.table import markdown_row
 from rl2grid.envs.tasks import all_tasks, short_id
 from rl2grid.records.ledger import HashedTest
+from rl2grid.records.looks import by_present_rules
 from rl2grid.records.statistics import aggregated
 
 KINDS = ("do nothing", "search and rules", "planner", "learned")
@@ -23,7 +24,7 @@ def overview_table(results: Mapping[str, HashedTest]) -> str:
         results: of a ledger.
     """
     by_task: dict[str, list[LedgerRow]] = {}
-    for row in ledger_rows(results, results):
+    for row in ledger_rows(by_present_rules(results), results):
         by_task.setdefault(row.first.task, []).append(row)
     order = {task: place for place, task in enumerate(all_tasks())}
     lines = [markdown_row(["task", *KINDS]), "|:--|" + ":--|" * len(KINDS)]

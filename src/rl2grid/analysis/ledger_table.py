@@ -16,7 +16,7 @@ from rl2grid.errors import one_of
 from rl2grid.mdp.constraint_table import CONSTRAINTS, THRESHOLDS
 from rl2grid.records.comparisons import Difference, holm, paired_differences
 from rl2grid.records.ledger import HashedTest
-from rl2grid.records.looks import budget, earlier_choices, method_of
+from rl2grid.records.looks import budget, by_present_rules, earlier_choices, is_outdated, method_of
 from rl2grid.records.month_values import common_months, unpack_months
 from rl2grid.records.statistics import UNIT, Scores, estimate
 from rl2grid.records.versions import TARGETS_VERSION
@@ -29,7 +29,8 @@ LEGEND = (
     "on the same months; p: that there is none, Holm's correction over the rows of the task. Completed and safe: "
     "shares of months, with Wilson's intervals. Marks: a, entered after other configurations of the same agent and "
     "heuristic had had their test on these months (their number); b, another budget (decisions, validations, months of "
-    "each) than most trained rows of the task with that heuristic; s, a run that had been evaluated on test months "
+    "each) than most trained rows of the task with that heuristic; r, an agent without training by earlier rules than "
+    "another row of it; s, a run that had been evaluated on test months "
     "before; t, trained under a heuristic with targets of an earlier version. Decisions of a training that began from "
     "another's policy are its own; imitation's are those of its labels, each as often as it was learned from."
 )
@@ -111,7 +112,8 @@ def short_ledger_table(results: Mapping[str, HashedTest], task: str) -> str:
         results: of a ledger.
         task: id of the task.
     """
-    rows = ledger_rows({digest: one for digest, one in results.items() if one.task == task}, results)
+    current = by_present_rules(results)
+    rows = ledger_rows({digest: one for digest, one in current.items() if one.task == task}, results)
     compared = _compared(rows, REFERENCE)
     heading = f"to {REFERENCE}"
     ranked = sorted(enumerate(rows), key=lambda one: -float(one[1].scores("survival").values.mean()))
@@ -155,6 +157,7 @@ def _marks(
     first = group[0]
     seen = len(earlier_choices(results, method_of(first), first.choice))
     marks = [f"a{seen}"] if seen else []
+    marks += ["r"] if is_outdated(first, results) else []
     if first.training:
         marks += ["b"] if budget(first) != usual[first.task, first.heuristic] else []
         marks += ["s"] if any(one.training.get("tested_before") for one in group) else []

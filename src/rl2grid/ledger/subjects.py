@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from rl2grid.agents.agent import RevisedAgent
 from rl2grid.agents.foresight import Foresight
 from rl2grid.algorithms.pretrained import is_pretrained, pretrained
 from rl2grid.envs.tasks import Task, find_task, short_id
@@ -175,7 +176,10 @@ def _untrained(agent: str, task: Task, heuristic: str | None, months: int | None
     if isinstance(made, Foresight):
         raise UsageError(f"Agent {agent!r} knows the future: it is not ranked, and has no test.")
     check_playable(made, task, {"split": TEST, "heuristic": heuristic})
-    configuration = {"agent": agent, "task": task.id, "heuristic": heuristic, "test": _test_of(task, months)}
+    configuration: dict[str, Any] = {"agent": agent, "task": task.id, "heuristic": heuristic}
+    configuration["test"] = _test_of(task, months)
+    if isinstance(made, RevisedAgent) and task.kind in made.rules:
+        configuration["rules"] = made.rules[task.kind]
     return Subject(configuration, agent, task, heuristic, {})
 
 

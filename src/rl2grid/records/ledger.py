@@ -77,6 +77,11 @@ class HashedTest:
         return agent_of(self.configuration)
 
     @property
+    def rules(self) -> int:
+        """Version of the rules of an agent without training."""
+        return int(self.configuration.get("rules", 1))
+
+    @property
     def player(self) -> str:
         """The agent, what it observes beside the paper's features, and of how many actions the what-if chose."""
         features = self.configuration.get("env_keywords", {}).get("operator_features")

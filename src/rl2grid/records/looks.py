@@ -47,6 +47,17 @@ def earlier_choices(results: Mapping[str, HashedTest], method: tuple[Any, ...], 
     return seen
 
 
+def is_outdated(result: HashedTest, results: Mapping[str, HashedTest]) -> bool:
+    """Whether an agent without training has had a test by later rules than these, with the same heuristic."""
+    method = method_of(result)
+    return any(other.rules > result.rules and method_of(other) == method for other in results.values())
+
+
+def by_present_rules(results: Mapping[str, HashedTest]) -> dict[str, HashedTest]:
+    """Without what is outdated."""
+    return {digest: one for digest, one in results.items() if not is_outdated(one, results)}
+
+
 def method_of(result: HashedTest) -> tuple[Any, ...]:
     """What the tests of one method on one list have in common: task, agent, heuristic and the version of the list."""
     return result.task, result.agent, result.heuristic, result.months["split_version"]
