@@ -11,6 +11,7 @@ import pytest
 import rl2grid  # noqa: F401 - registers the tasks
 from rl2grid.agents.do_nothing import DoNothing
 from rl2grid.agents.foresight import Foresight
+from rl2grid.agents.planner import Planner
 from rl2grid.envs.tasks import find_task
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.protocol import evaluate, first_months
@@ -70,7 +71,7 @@ def test_in_a_joint_task_another_topology_action_keeps_the_injection_of_the_guid
     agent = Foresight(Shifting(), ahead=12, candidates=3, attempts=5)
     env, observation, info = begun(agent, "bus14-H0")
     agent.act(observation, info)
-    tried = [action for _, action in agent._attempts_at(list(agent._course))]
+    tried = [attempt.action for attempt in agent._attempts_at(list(agent._course))]
     assert tried
     for action in tried:
         assert env.action_space.contains(action)
@@ -88,8 +89,27 @@ def test_it_forgets_the_future_of_an_action_that_was_not_played():
     assert agent._course[0].step == info["step"] + 1
 
 
+@pytest.mark.parametrize(("task", "first_is_told"), [("bus14-R", True), ("bus14-H0", True), ("bus14-T0", False)])
+def test_where_power_is_dispatched_the_planner_is_told_what_comes(task, first_is_told):
+    agent = Foresight(Planner(), ahead=12, candidates=3, attempts=5)
+    _, observation, info = begun(agent, task)
+    agent.act(observation, info)
+    decisions = list(agent._course)
+    attempts = list(agent._attempts_at(decisions))
+    assert (attempts[0].foretold is not None) is first_is_told
+    told = [attempt.foretold for attempt in attempts if attempt.foretold is not None]
+    assert all(each.step == decisions[-1].step for each in told)
+    assert all(attempt.foretold is not None for attempt in attempts) is (task == "bus14-R")
+
+
+def test_redispatching_it_outlives_nobody_by_less():
+    bound, alone = survived(Foresight(ahead=48), "bus14-R"), survived(Planner(), "bus14-R")
+    assert bound.grid_steps >= alone.grid_steps
+    assert bound.foresight > 0
+
+
 def test_tasks_without_topology_and_nonsense_are_refused():
-    with pytest.raises(UsageError, match="has no topology actions: choose a topology task"):
+    with pytest.raises(UsageError, match="no topology actions to try, and only the planner"):
         foresight().bind(gymnasium.make("rl2grid/bus14-R-v0", split="bundled"))
     for attempts in (0, 2.5, "many", True, None):
         with pytest.raises(UsageError, match=r"attempts=.* is not allowed: give a whole number"):

@@ -8,7 +8,9 @@ import pytest
 
 import rl2grid  # noqa: F401  (registers the tasks)
 from rl2grid.agents.agent import no_intervention
-from rl2grid.agents.planner import INGREDIENTS, Planner
+from rl2grid.agents.planner import INGREDIENTS, Foretold, Planner
+from rl2grid.agents.secure_dispatch import undispatched
+from rl2grid.engines.native.what_if import WhatIf, snapshot_of
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import AGENTS, kinds_of, make_agent
 
@@ -155,6 +157,28 @@ def test_what_was_asked_for_and_not_reached_is_given_up_while_nothing_is_planned
     np.testing.assert_array_equal(state.actual_dispatch[0], dispatched)
 
 
+def test_forewarned_it_makes_the_grid_ready_for_a_loss_that_nobody_publishes():
+    left = []
+    for told in (True, False):
+        env = environment("bus36-M-R")
+        agent = Planner()
+        agent.bind(env)
+        observation, info = env.reset(seed=0, options={"start": 220})
+        agent.reset(0)
+        base = env.unwrapped
+        what_if = WhatIf(base.grid)
+        lines = np.arange(base.grid.n_line, dtype=np.int32)
+        loading = what_if.outages(snapshot_of(base.engine, 0), lines).worst_loading
+        worst = np.argsort(-np.where(np.isfinite(loading), loading, 0.0))[:1].astype(np.int32)
+        assert loading[worst] > 1.0
+        if told:
+            agent.forewarn(Foretold(int(base.state.step[0]) + 24, worst, undispatched(base.state, base.grid)))
+        for _ in range(18):
+            observation, *_, info = env.step(agent.act(observation, info))
+        left.append(float(what_if.outages(snapshot_of(base.engine, 0), worst).worst_loading[0]))
+    assert left[0] < left[1] - 0.02
+
+
 def test_it_says_why():
     env = environment("bus36-MO-v0-T0")
     agent = Planner()
@@ -172,7 +196,7 @@ def test_ingredients_are_left_out_by_name():
             Planner(without=nonsense)  # type: ignore[arg-type]
     with pytest.raises(UsageError, match=r"Ingredient 'luck'.*sequences"):
         Planner(without=["luck"])
-    assert set(INGREDIENTS) == {"sequences", "danger", "restoring", "prevention", "dispatch first"}
+    assert set(INGREDIENTS) == {"sequences", "danger", "restoring", "prevention", "dispatch first", "trend"}
     for each in INGREDIENTS:
         play(Planner(without=[each]), environment("bus36-MO-v0-H0"), steps=5)
 

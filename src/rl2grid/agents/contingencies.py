@@ -17,6 +17,9 @@ _SOON = 60
 _MAINTENANCE_WEIGHT = 3.0
 """What an outage counts that is sure to come, beside an attack that may."""
 
+_CERTAIN_WEIGHT = 20.0
+"""The same of one that somebody knows of."""
+
 
 class Contingencies(NamedTuple):
     """Lines in service that may be lost soon, one at a time."""
@@ -46,6 +49,13 @@ def expected(grid: Grid, state: GridState) -> Contingencies:
     lines = np.concatenate((planned, attackable)).astype(np.int32)
     weight = np.concatenate((np.full(len(planned), _MAINTENANCE_WEIGHT), _attack_weights(grid, state, attackable)))
     return Contingencies(lines, weight)
+
+
+def with_certain(contingencies: Contingencies, lines: I32) -> Contingencies:
+    """The same, and the loss of these lines as sure as announced maintenance many times over."""
+    others = ~np.isin(contingencies.lines, lines)
+    weight = np.concatenate((np.full(len(lines), _CERTAIN_WEIGHT), contingencies.weight[others]))
+    return Contingencies(np.concatenate((lines, contingencies.lines[others])).astype(np.int32), weight)
 
 
 def danger(what_if: WhatIf, point: Snapshot, contingencies: Contingencies) -> float:

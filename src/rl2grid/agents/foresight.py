@@ -13,7 +13,8 @@ import gymnasium
 import numpy as np
 
 from rl2grid.agents.agent import Action, Agent, Considered, Info, Observation, topology_part
-from rl2grid.agents.planner import Planner
+from rl2grid.agents.planner import Foretold, Planner
+from rl2grid.agents.secure_dispatch import undispatched
 from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.engines.worlds import World
 from rl2grid.errors import UsageError
@@ -49,6 +50,16 @@ class _Course(NamedTuple):
     """The last grid step that was survived."""
 
 
+class _Attempt(NamedTuple):
+    """Decisions up to one at which something else is tried."""
+
+    decisions: Sequence[_Decision]
+    action: Action | None = None
+    """What is played there; None: what the guide chooses."""
+    foretold: Foretold | None = None
+    """What the guide is told from there on."""
+
+
 class Foresight:
     """Plays the true future in advance and takes back what ends badly: a bound, not a player.
 
@@ -71,7 +82,7 @@ class Foresight:
     """
 
     name = "foresight"
-    kinds = ("T", "H")
+    kinds = ("T", "R", "H")
 
     def __init__(
         self,
@@ -97,13 +108,14 @@ class Foresight:
         """Make a copy of the environment, in which the future is played.
 
         Raises:
-            UsageError: a task without topology actions, or the reference engine, which answers no what-if.
+            UsageError: a redispatching task with another guide than the planner, or the reference engine, which answers
+                no what-if.
         """
         base: Any = env.unwrapped
-        if not base.task.changes_topology:
+        if not base.task.changes_topology and not isinstance(self._guide, Planner):
             raise UsageError(
-                f"Agent {self.name!r} cannot play {base.task.id}, which has no topology actions: choose a topology "
-                "task (-T0-) or a joint one (-H0-)."
+                f"Agent {self.name!r} cannot play {base.task.id}, which has no topology actions to try, and only the "
+                "planner can be told what to dispatch against: leave out the guide, or choose a task with topology."
             )
         if not isinstance(base.engine, NativeEngine):
             raise UsageError(f'Agent {self.name!r} asks what-ifs of the native engine: choose engine="native".')
@@ -156,13 +168,14 @@ class Foresight:
         death, left = course.step, self._attempts
         while left > 0:
             until, longest = course.step + _PAST, course
-            for decisions, action in itertools.islice(self._attempts_at(course.decisions), left):
+            for attempt in itertools.islice(self._attempts_at(course.decisions), left):
                 left -= 1
-                *before, last = decisions
-                played = self._play(last.world, action, None, until)
+                *before, last = attempt.decisions
+                played = self._tried(attempt, last.world, until)
                 played = played._replace(decisions=[*before, *played.decisions])
                 if not played.lost:
-                    self._why = f"the game over of step {death} is averted by another action in step {last.step}"
+                    what = "another action in" if attempt.foretold is None else "another dispatch from"
+                    self._why = f"the game over of step {death} is averted by {what} step {last.step}"
                     return played
                 if played.step > longest.step:
                     longest = played
@@ -172,24 +185,54 @@ class Foresight:
         self._why = f"nothing was found that averts the game over of step {course.step}"
         return course
 
-    def _attempts_at(self, decisions: Sequence[_Decision]) -> Iterator[tuple[Sequence[_Decision], Action]]:
-        """The decisions up to one at which something else is played, and what: the last ones first."""
+    def _tried(self, attempt: _Attempt, world: World, until: int) -> _Course:
+        if attempt.foretold is None:
+            return self._play(world, attempt.action, None, until)
+        assert isinstance(self._guide, Planner)
+        self._guide.forewarn(attempt.foretold)
+        played = self._play(world, None, None, until)
+        self._guide.forewarn(None)
+        return played
+
+    def _attempts_at(self, decisions: Sequence[_Decision]) -> Iterator[_Attempt]:
+        """What is tried: first to tell the guide what comes, then other topology actions, the last decisions first."""
         crisis = len(decisions) - 1
         while crisis > 0 and not decisions[crisis - 1].safe:
             crisis -= 1
+        if isinstance(self._guide, Planner) and self._present.task.injects:
+            foretold = self._foretold(decisions[-1].world)
+            for earlier in (0, *_EARLIER, self._ahead):
+                at = max(crisis - earlier, 0)
+                yield _Attempt(decisions[: at + 1], foretold=self._lost_from(decisions[at].world, foretold))
+                if at == 0:
+                    break
+        if self._present.task.changes_topology:
+            yield from self._topology_attempts(decisions, crisis)
+
+    def _foretold(self, world: World) -> Foretold:
+        """The last moment before a death, and all lines that are out then."""
+        self._future.restore(world)
+        state = self._future.state
+        lines = np.flatnonzero(~state.line_status[0]).astype(np.int32)
+        return Foretold(int(state.step[0]), lines, undispatched(state, self._future.grid))
+
+    def _lost_from(self, world: World, foretold: Foretold) -> Foretold:
+        """The same, of the lines that are in service in a world."""
+        self._future.restore(world)
+        return foretold._replace(lines=foretold.lines[self._future.state.line_status[0][foretold.lines]])
+
+    def _topology_attempts(self, decisions: Sequence[_Decision], crisis: int) -> Iterator[_Attempt]:
         remedies = self._best_at(decisions[crisis].world)
         for at in range(len(decisions) - 1, crisis - 1, -1):
             yield from self._others(decisions[: at + 1], self._best_at(decisions[at].world))
         for at in (crisis - earlier for earlier in _EARLIER if earlier <= crisis):
             yield from self._others(decisions[: at + 1], remedies)
 
-    def _others(
-        self, decisions: Sequence[_Decision], topologies: Iterable[int]
-    ) -> Iterator[tuple[Sequence[_Decision], Action]]:
+    def _others(self, decisions: Sequence[_Decision], topologies: Iterable[int]) -> Iterator[_Attempt]:
         """The last decision with other topology actions; what it injects in a joint task stays."""
         played = decisions[-1].action
         others = (topology for topology in topologies if topology != topology_part(played))
-        return ((decisions, _with_topology(played, topology)) for topology in others)
+        return (_Attempt(decisions, _with_topology(played, topology)) for topology in others)
 
     def _best_at(self, world: World) -> list[int]:
         """Nothing, and the topology actions with the least worst loading in the next step."""

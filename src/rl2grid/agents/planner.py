@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rl2grid.agents.agent import Action, Considered, Info, Observation, injecting_action, topology_part
-from rl2grid.agents.contingencies import NONE, Contingencies, danger, expected
+from rl2grid.agents.contingencies import NONE, Contingencies, danger, expected, with_certain
 from rl2grid.agents.dispatch import controls, encode, worst_loading
 from rl2grid.agents.greedy_topology import effects
-from rl2grid.agents.secure_dispatch import SecureDispatch, Series
+from rl2grid.agents.secure_dispatch import SecureDispatch, Series, undispatched, with_change
 from rl2grid.agents.topology_search import NOTHING, SAFE, TopologySearch
-from rl2grid.arrays import F32, F64
+from rl2grid.arrays import F32, F64, I32
 from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.engines.native.what_if import WhatIf, forecast_of, snapshot_of
 from rl2grid.errors import UsageError, one_of
@@ -35,6 +35,7 @@ INGREDIENTS = (
     "restoring",
     "prevention",
     "dispatch first",
+    "trend",
 )
 """What can be left out of the planner, to see what it is worth."""
 _RESTORE_BELOW = 0.93
@@ -55,6 +56,14 @@ _FIRST_REQUEST = 1e-5
 """MW that count as a request and change nothing."""
 _NEGLIGIBLE_PLAN, _NEGLIGIBLE_REQUEST = 0.05, 0.01
 """MW, and entries of an action, below which a plan changes nothing."""
+
+
+class Foretold(NamedTuple):
+    """What somebody who knows the future tells the planner of a moment to come."""
+
+    step: int
+    lines: I32  # lost until then
+    injection: F64  # [topo] MW then, if nothing were dispatched
 
 
 class _Moment(NamedTuple):
@@ -96,6 +105,7 @@ class Planner:
                 raise one_of("Ingredient", each, INGREDIENTS)
         if seconds is not None and not _is_positive(seconds):
             raise UsageError(f"seconds={seconds!r} is not allowed: give a positive number.")
+        self._foretold: Foretold | None = None
         self._without, self._seconds = frozenset(without), seconds
         self.name = "planner" + "".join(f" without {each}" for each in sorted(self._without))
         if seconds is not None:
@@ -153,6 +163,10 @@ class Planner:
         if self._search is not None:
             self._topology = topology_part(action)
         return action
+
+    def forewarn(self, foretold: Foretold | None) -> None:
+        """Dispatch against what is foretold, until it is there; None: against what is forecast and published alone."""
+        self._foretold, self._is_plan_void = foretold, True
 
     def _choose(self, moment: _Moment) -> Action:
         if moment.safe and self._is_calm(moment):
@@ -290,7 +304,11 @@ class Planner:
         outlook = self._env.engine.outlook(0)
         # An imagined world goes on from forecasts of an earlier step, the last of which repeats.
         past = min(int(state.step[0]) + 1 - outlook.first_step, len(outlook.prod_p) - 1)
-        return self._dispatch.foreseen(state, outlook.prod_p[past:])
+        series = self._dispatch.foreseen(state, outlook.prod_p[past:])
+        foretold = self._foretold_at(state)
+        if foretold is not None:
+            return with_change(series, foretold.injection - undispatched(state, self._grid))
+        return series._replace(trend=np.zeros_like(series.trend)) if "trend" in self._without else series
 
     def _injection(self, moment: _Moment, point: Snapshot, topology: int, series: Series) -> F32 | None:
         """The continuous action with a topology action, float32 [continuous]; None: none, or it cannot be followed."""
@@ -306,7 +324,14 @@ class Planner:
             point = self._search.after(point, topology)
         prevents = bool(self._grid.opponent.areas) and "prevention" not in self._without
         contingencies = expected(self._grid, moment.state) if prevents else NONE
-        return self._dispatch.plan(moment.state, point, series, contingencies, not moment.safe, steps)
+        foretold, everything = self._foretold_at(moment.state), not moment.safe
+        if foretold is not None:
+            contingencies, everything = with_certain(contingencies, foretold.lines), True
+        return self._dispatch.plan(moment.state, point, series, contingencies, everything, steps)
+
+    def _foretold_at(self, state: GridState) -> Foretold | None:
+        is_to_come = self._foretold is not None and int(state.step[0]) < self._foretold.step
+        return self._foretold if is_to_come else None
 
     def _towards(self, topology: int, planned: F64) -> F32 | None:
         """The continuous action that comes nearer to a plan; None: nothing of it is left, or it cannot be followed."""

@@ -148,7 +148,7 @@ class SecureDispatch:
         """
         step = int(state.step[0])
         before = [seen for seen in self._history if step - _TREND <= seen.step < step]
-        self._history = [*before, _Seen(step, self._undispatched(state))]
+        self._history = [*before, _Seen(step, undispatched(state, self._grid))]
 
     def foreseen(self, state: GridState, forecast: F32) -> Series:
         """The series of the redispatchable generators, now and at the horizons of the programme.
@@ -249,14 +249,6 @@ class SecureDispatch:
         if abs(total) > abs(excess):
             change[:n_gen][waiting] *= 1.0 - excess / total
         return control.now + change
-
-    def _undispatched(self, state: GridState) -> F64:
-        dispatched = state.gen_p[0] - state.actual_dispatch[0]
-        produced = np.where(state.gen_renewable, state.gen_p_before_curtail[0], dispatched)
-        injection = np.zeros(self._grid.dim_topo)
-        injection[self._grid.gen_pos_topo_vect] = produced
-        injection[self._grid.load_pos_topo_vect] = -state.load_p[0].astype(np.float64)
-        return injection
 
     def _trend(self) -> F64:
         """MW more that every element injects in a step, float64 [topo]; zeros where no past is known."""
@@ -434,6 +426,20 @@ class SecureDispatch:
                     (column, np.ones((1, n))),
                     (missing, -np.ones(1)),
                 )
+
+
+def undispatched(state: GridState, grid: Grid) -> F64:
+    """MW that every element would inject if nothing were dispatched, curtailed or stored, float64 [topo]."""
+    series = state.gen_p[0] - state.actual_dispatch[0]
+    injection = np.zeros(grid.dim_topo)
+    injection[grid.gen_pos_topo_vect] = np.where(state.gen_renewable, state.gen_p_before_curtail[0], series)
+    injection[grid.load_pos_topo_vect] = -state.load_p[0].astype(np.float64)
+    return injection
+
+
+def with_change(series: Series, change: F64) -> Series:
+    """The series where not the trend but somebody who knows says how all injections will have changed, MW [topo]."""
+    return series._replace(trend=change / (_LATER * _TREND_SHARE))
 
 
 def _case(weight: float, bound: float, flow: F64, effect: F64, limit: F64) -> _Case:
