@@ -35,6 +35,11 @@ def play(agent: Any, env: Any, seed: int = 0, steps: int = DAYS) -> tuple[list[A
     return actions, float(info["survival"]), info
 
 
+def why(agent: Planner) -> str:
+    considered = agent.explain()
+    return "" if considered is None else considered.why
+
+
 class Nothing:
     def bind(self, env: Any) -> None:
         self._action = no_intervention(env.action_space)
@@ -89,8 +94,10 @@ def test_it_tells_the_single_actions_that_a_search_compared():
 
 def test_prevention_shifts_power_while_the_grid_is_safe():
     env = environment("bus36-MO-v0-H0", opponent=True)
-    play(Planner(), env, steps=60)
+    agent = Planner()
+    play(agent, env, steps=60)
     shifted = float(np.abs(env.unwrapped.state.actual_dispatch[0]).sum())
+    assert "power is shifted" in why(agent)
     other = environment("bus36-MO-v0-H0", opponent=True)
     play(Planner(without=["prevention"]), other, steps=60)
     assert shifted > 10.0

@@ -57,6 +57,9 @@ _FIRST_REQUEST = 1e-5
 _NEGLIGIBLE_PLAN, _NEGLIGIBLE_REQUEST = 0.05, 0.01
 """MW, and entries of an action, below which a plan changes nothing."""
 
+_PRESSED = "while the grid is safe, power is shifted at once: a line will be loaded too much, or generators take over"
+_PREVENTIVE = "while the grid is safe, power is shifted so that it stays so after a loss, or back to rest"
+
 
 class Foretold(NamedTuple):
     """What somebody who knows the future tells the planner of a moment to come."""
@@ -255,7 +258,10 @@ class Planner:
         if due or (self._age >= _LEAST_AGE and self._drifts(state, series)):
             self._age, self._is_plan_void = 0, False
             self._planned = self._plan(moment, point, topology, series, 1 if pressed else _PERIOD)
-        return None if self._planned is None else self._towards(topology, self._planned)
+        injection = None if self._planned is None else self._towards(topology, self._planned)
+        if injection is not None and not self._why:
+            self._why = _PRESSED if pressed else _PREVENTIVE
+        return injection
 
     def _drifts(self, state: GridState, series: Series) -> bool:
         assert self._dispatch is not None
