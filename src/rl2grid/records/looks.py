@@ -48,9 +48,8 @@ def earlier_choices(results: Mapping[str, HashedTest], method: tuple[Any, ...], 
 
 
 def is_outdated(result: HashedTest, results: Mapping[str, HashedTest]) -> bool:
-    """Whether an agent without training has had a test by later rules than these, with the same heuristic."""
-    method = method_of(result)
-    return any(other.rules > result.rules and method_of(other) == method for other in results.values())
+    """Whether an agent without training has had a test on the task by later rules than these, with any heuristic."""
+    return any(other.rules > result.rules and _played_by(other) == _played_by(result) for other in results.values())
 
 
 def by_present_rules(results: Mapping[str, HashedTest]) -> dict[str, HashedTest]:
@@ -69,6 +68,10 @@ def budget(result: HashedTest) -> tuple[tuple[str, Any], ...]:
         return ()
     decisions = result.configuration["hyperparameters"]["total_timesteps"]
     return tuple(sorted({"decisions": decisions, **result.training["identity"].get("budget", {})}.items()))
+
+
+def _played_by(result: HashedTest) -> tuple[Any, ...]:
+    return result.task, result.agent, result.months["split_version"]
 
 
 def _list_of(result: HashedTest) -> tuple[str, Any]:
