@@ -64,4 +64,4 @@ def test_bad_requests_are_refused_with_one_sentence(capsys, tmp_path, flags, wor
 
 def test_nobody_plays_before_all_are_known_to_be_able_to(monkeypatch, tmp_path):
     monkeypatch.setattr(watching, "play_to_watch", lambda *_, **__: pytest.fail("played"))
-    assert main(["watch", "do-nothing", "bus14-R", "--against", "foresight", "--output", str(tmp_path / "w")]) == 2
+    assert main(["watch", "do-nothing", "bus14-T0", "--against", "dc-opf", "--output", str(tmp_path / "w")]) == 2
