@@ -65,11 +65,11 @@ class Foresight:
 
     It lets a guide, the planner, play on from saved true worlds, some hours ahead of the episode. Where that ends in a
     game over, it goes back decision by decision, first through the crisis, then to moments before it began, plays
-    another topology action there (in a joint task with the injection of the guide) and lets the guide go on; what
-    outlives the moment of the death by two hours is kept. So its
-    survival can be reached by one who reacts like the planner and knows all attacks, outages and demand: a lower bound
-    of the best possible. It is marked as an agent with foresight and never ranked with others. Its name says who guides
-    it and how far it looks, where that is not as by default.
+    another topology action there (in a joint task with the injection of the guide) and lets the guide go on; where
+    power can be dispatched, it first tells the planner what comes, so that the grid is ready; what outlives the moment
+    of the death by two hours is kept. So its survival can be reached by one who reacts like the planner and knows all
+    attacks, outages and demand: a lower bound of the best possible. It is marked as an agent with foresight and never
+    ranked with others. Its name says who guides it and how far it looks, where that is not as by default.
 
     Args:
         guide: who plays on, from any state and whatever was played before; None: the planner.

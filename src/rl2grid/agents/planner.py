@@ -81,10 +81,10 @@ class _Moment(NamedTuple):
 class Planner:
     """Keeps the grid secure by topology, by redispatch, curtailment and storage, or by both in one step.
 
-    While the grid is safe, it closes lines, brings substations back where that is safe and makes no outage worse, and,
-    where there is an opponent, shifts power every half hour so that no attack or announced outage would overload a
-    line (:class:`~rl2grid.agents.secure_dispatch.SecureDispatch`). When it is not safe, it looks for the sequence of
-    topology actions that makes it so before protections trip a line
+    While the grid is safe, it closes lines, brings substations back where that is safe and makes no outage worse, and
+    shifts power so that no line is overloaded half an hour later by the trend and, where there is an opponent, after no
+    attack or announced outage (:class:`~rl2grid.agents.secure_dispatch.SecureDispatch`). When it is not safe, it looks
+    for the sequence of topology actions that makes it so before protections trip a line
     (:class:`~rl2grid.agents.topology_search.TopologySearch`), and dispatches against what is left; where both can be
     done, dispatch comes first. It knows forecasts, announced maintenance and which lines the opponent may attack, not
     when. It is meant to be played without a heuristic, because it acts while the grid is safe.
