@@ -40,6 +40,15 @@ def why(agent: Planner) -> str:
     return "" if considered is None else considered.why
 
 
+def begun(task: str, start: int) -> tuple[Planner, Any]:
+    """A planner, and an environment that it is about to play from a row of the month on."""
+    agent, env = Planner(), environment(task)
+    agent.bind(env)
+    env.reset(seed=0, options={"start": start})
+    agent.reset(0)
+    return agent, env
+
+
 class Nothing:
     def bind(self, env: Any) -> None:
         self._action = no_intervention(env.action_space)
@@ -131,11 +140,7 @@ def test_brought_back_it_plans_anew_and_knows_nothing_of_what_it_saw_later():
 
 
 def test_curtailment_stays_as_it_is_while_nothing_is_planned():
-    env = environment("bus14-R")
-    agent = Planner()
-    agent.bind(env)
-    env.reset(seed=0, options={"start": 140})
-    agent.reset(0)
+    agent, env = begun("bus14-R", 140)
     limits = np.zeros(env.action_space.shape, np.float32)
     limits[3:] = -0.9
     env.step(limits)
@@ -148,11 +153,7 @@ def test_curtailment_stays_as_it_is_while_nothing_is_planned():
 
 def test_what_was_asked_for_and_not_reached_is_given_up_while_nothing_is_planned():
     """So that nothing is solved again, and a series that rises too fast for its generators ends nothing."""
-    env = environment("bus14-R")
-    agent = Planner()
-    agent.bind(env)
-    env.reset(seed=0, options={"start": 140})
-    agent.reset(0)
+    agent, env = begun("bus14-R", 140)
     request = np.zeros(env.action_space.shape, np.float32)
     request[0] = 1.0
     env.step(request)

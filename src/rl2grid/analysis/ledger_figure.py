@@ -10,11 +10,10 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import PercentFormatter
 
 from rl2grid.analysis.figures import wrapped_label
-from rl2grid.analysis.ledger_table import LedgerRow, ledger_rows
+from rl2grid.analysis.ledger_table import LedgerRow, present_rows
 from rl2grid.drawing.theme import LIGHT, Theme, style
 from rl2grid.envs.tasks import short_id
 from rl2grid.records.ledger import HashedTest
-from rl2grid.records.looks import by_present_rules
 from rl2grid.records.statistics import estimate
 
 
@@ -29,8 +28,7 @@ def draw_ledger(results: Mapping[str, HashedTest], task: str, *, theme: Theme = 
     Raises:
         ValueError: the ledger has no result of the task.
     """
-    current = by_present_rules(results)
-    rows = ledger_rows({digest: one for digest, one in current.items() if one.task == task}, results)
+    rows = present_rows(results, task)
     if not rows:
         raise ValueError(f"The ledger has no result of {task}.")
     found = sorted(((estimate(row.scores("survival")), row) for row in rows), key=lambda one: one[0].value)

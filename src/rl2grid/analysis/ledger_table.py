@@ -112,8 +112,7 @@ def short_ledger_table(results: Mapping[str, HashedTest], task: str) -> str:
         results: of a ledger.
         task: id of the task.
     """
-    current = by_present_rules(results)
-    rows = ledger_rows({digest: one for digest, one in current.items() if one.task == task}, results)
+    rows = present_rows(results, task)
     compared = _compared(rows, REFERENCE)
     heading = f"to {REFERENCE}"
     ranked = sorted(enumerate(rows), key=lambda one: -float(one[1].scores("survival").values.mean()))
@@ -133,6 +132,12 @@ def short_ledger_table(results: Mapping[str, HashedTest], task: str) -> str:
     shown = {name: cells for name, cells in columns.items() if any(cells)}
     lines = [markdown_row(list(shown)), "|" + ":--|" + "--:|" * (len(shown) - 1)]
     return "\n".join([*lines, *(markdown_row(cells) for cells in zip(*shown.values(), strict=True))])
+
+
+def present_rows(results: Mapping[str, HashedTest], task: str) -> list[LedgerRow]:
+    """The rows of a task, without those by earlier rules of an agent."""
+    current = by_present_rules(results)
+    return ledger_rows({digest: one for digest, one in current.items() if one.task == task}, results)
 
 
 def ledger_rows(shown: Mapping[str, HashedTest], results: Mapping[str, HashedTest]) -> list[LedgerRow]:
