@@ -1,5 +1,6 @@
 """The planner on all kinds of task: what it reaches, what it refuses, and that nothing but the seed decides."""
 
+from collections.abc import Collection
 from typing import Any
 
 import gymnasium
@@ -9,8 +10,8 @@ import pytest
 import rl2grid  # noqa: F401  (registers the tasks)
 from rl2grid.agents.agent import no_intervention
 from rl2grid.agents.planner import INGREDIENTS, Foretold, Planner
-from rl2grid.agents.secure_dispatch import undispatched
-from rl2grid.engines.native.what_if import WhatIf, snapshot_of
+from rl2grid.agents.trend import later_of, undispatched
+from rl2grid.engines.native.what_if import WhatIf, forecast_of, snapshot_of
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import AGENTS, kinds_of, make_agent
 
@@ -40,11 +41,11 @@ def why(agent: Planner) -> str:
     return "" if considered is None else considered.why
 
 
-def begun(task: str, start: int) -> tuple[Planner, Any]:
+def begun(task: str, start: int, seed: int = 0, without: Collection[str] = ()) -> tuple[Planner, Any]:
     """A planner, and an environment that it is about to play from a row of the month on."""
-    agent, env = Planner(), environment(task)
+    agent, env = Planner(without), environment(task)
     agent.bind(env)
-    env.reset(seed=0, options={"start": start})
+    env.reset(seed=seed, options={"start": start})
     agent.reset(0)
     return agent, env
 
@@ -113,6 +114,25 @@ def test_prevention_shifts_power_while_the_grid_is_safe():
     assert shifted > 2 * float(np.abs(other.unwrapped.state.actual_dispatch[0]).sum())
 
 
+def test_topology_is_made_ready_for_announced_maintenance_while_the_grid_is_safe():
+    """Twelve steps before: the worst loading without the line is less after what it plays than after nothing."""
+    agent, env = begun("bus118-M-T1", 385, seed=1)
+    state = env.unwrapped.state
+    assert (state.time_next_maintenance[0] == 12).any()
+    action = agent.act(*env.unwrapped.restore(env.unwrapped.save()))
+    assert "made ready for what is to come" in why(agent)
+    point = forecast_of(env.unwrapped.engine, 0)
+    assert point is not None
+    assert agent._search is not None
+    grid = env.unwrapped.grid
+    later = later_of(state, point, grid, np.zeros(grid.dim_topo))
+    assert agent._search.worst_later(agent._search.after(point, action), later) < agent._search.worst_later(
+        point, later
+    )
+    other, env = begun("bus118-M-T1", 385, seed=1, without=["preparing"])
+    assert other.act(*env.unwrapped.restore(env.unwrapped.save())) == 0
+
+
 def test_the_same_seed_gives_the_same_actions_and_asking_leaves_the_episode_as_it_is():
     first = play(Planner(), environment("bus36-MO-v0-H0"), seed=4, steps=80)
     again = play(Planner(), environment("bus36-MO-v0-H0"), seed=4, steps=80)
@@ -132,8 +152,7 @@ def test_brought_back_it_plans_anew_and_knows_nothing_of_what_it_saw_later():
         observation, *_, info = env.step(agent.act(observation, info))
     observation, info = env.unwrapped.restore(world)
     again = agent.act(observation, info)
-    assert agent._dispatch is not None
-    assert max(seen.step for seen in agent._dispatch._history) == info["step"]
+    assert max(seen.step for seen in agent._trend._history) == info["step"]
     env.unwrapped.restore(world)
     asked_twice = agent.act(observation, info)
     np.testing.assert_array_equal(again["injection"], asked_twice["injection"])
@@ -204,7 +223,15 @@ def test_ingredients_are_left_out_by_name():
             Planner(without=nonsense)  # type: ignore[arg-type]
     with pytest.raises(UsageError, match=r"Ingredient 'luck'.*sequences"):
         Planner(without=["luck"])
-    assert set(INGREDIENTS) == {"sequences", "danger", "restoring", "prevention", "dispatch first", "trend"}
+    assert set(INGREDIENTS) == {
+        "sequences",
+        "danger",
+        "restoring",
+        "prevention",
+        "dispatch first",
+        "trend",
+        "preparing",
+    }
     for each in INGREDIENTS:
         play(Planner(without=[each]), environment("bus36-MO-v0-H0"), steps=5)
 

@@ -27,8 +27,7 @@ def dispatch_of(env: Any) -> SecureDispatch:
 
 
 def series_of(env: Any, dispatch: SecureDispatch) -> Any:
-    dispatch.watch(env.state)
-    return dispatch.foreseen(env.state, env.imagine(0).series.prod_p)
+    return dispatch.foreseen(env.state, env.imagine(0).series.prod_p, np.zeros(env.grid.dim_topo))
 
 
 @pytest.mark.parametrize("grid_id", ["bus14", "bus36-M"])
@@ -119,35 +118,16 @@ def test_a_dispatch_outside_of_what_generators_can_do_has_drifted():
     assert dispatch.is_drifting(env.state, series)
 
 
-def forecast_after(env, dispatch, *moments):
-    """A forecast of 50 MW of every generator, once what they produced at these steps has been watched."""
-    gens = continuous_layout(env.grid).redispatch
-    for step, value in moments:
-        env.state.step[0] = step
-        env.state.gen_p[0][gens] = value
-        dispatch.watch(env.state)
-    forecast = np.zeros((1, env.grid.n_gen), np.float32)
-    forecast[0, gens] = 50.0
-    return forecast
-
-
 def test_beyond_the_forecasts_the_trend_goes_on():
     env = standing("bus14-R")
-    dispatch = dispatch_of(env)
-    forecast = forecast_after(env, dispatch, (1, 90.0), (8, 40.0), (10, 44.0))  # the first is too long ago
-    series = dispatch.foreseen(env.state, forecast)
+    gens, change = continuous_layout(env.grid).redispatch, np.zeros(env.grid.dim_topo)
+    env.state.gen_p[0][gens] = 44.0
+    change[env.grid.gen_pos_topo_vect[gens]] = 2.0
+    forecast = np.zeros((1, env.grid.n_gen), np.float32)
+    forecast[0, gens] = 50.0
+    series = dispatch_of(env).foreseen(env.state, forecast, change)
     np.testing.assert_allclose(series.now, 44.0)
     np.testing.assert_allclose(series.ahead[:, 0], [50.0, 54.0, 60.0, 72.0])
-    dispatch.reset()
-    dispatch.watch(env.state)
-    np.testing.assert_allclose(dispatch.foreseen(env.state, forecast).ahead[:, 0], 50.0)
-
-
-def test_who_is_brought_back_forgets_what_came_later():
-    env = standing("bus14-R")
-    dispatch = dispatch_of(env)
-    forecast = forecast_after(env, dispatch, (10, 44.0), (11, 90.0), (12, 10.0), (10, 44.0))
-    np.testing.assert_allclose(dispatch.foreseen(env.state, forecast).ahead[:, 0], 50.0)
 
 
 def test_a_plan_counts_only_what_the_forecast_says_of_the_next_step():
@@ -198,18 +178,3 @@ def test_what_curtailment_holds_makes_the_next_step_count():
     point, series = snapshot_of(env.engine, 0), series_of(env, dispatch)
     env.state.gen_p_before_curtail[0][layout.curtail] = env.state.gen_p[0][layout.curtail] + 5.0
     assert dispatch.is_pressed(env.state, point, series)
-
-
-def test_the_trend_is_of_what_nobody_dispatched_or_curtailed():
-    env = standing("bus14-R")
-    dispatch, layout, state = dispatch_of(env), continuous_layout(env.grid), env.state
-    gen, renewable = int(layout.redispatch[0]), int(layout.curtail[0])
-    for step, made, available, load in ((4, 40.0, 20.0, 10.0), (8, 48.0, 28.0, 14.0)):
-        state.step[0] = step
-        state.gen_p[0][gen], state.actual_dispatch[0][gen] = made + 7.0 * step, 7.0 * step
-        state.gen_p[0][renewable], state.gen_p_before_curtail[0][renewable] = 1.0, available
-        state.load_p[0][0] = load
-        dispatch.watch(state)
-    trend = dispatch.foreseen(state, np.zeros((1, env.grid.n_gen), np.float32)).trend
-    positions = [env.grid.gen_pos_topo_vect[[gen, renewable]], env.grid.load_pos_topo_vect[[0]]]
-    np.testing.assert_allclose(trend[np.concatenate(positions)], [2.0, 2.0, -1.0])

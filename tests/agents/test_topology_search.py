@@ -9,6 +9,7 @@ import pytest
 import rl2grid  # noqa: F401  (registers the tasks)
 from rl2grid.agents.contingencies import NONE, Contingencies, danger
 from rl2grid.agents.topology_search import NOTHING, TopologySearch
+from rl2grid.agents.trend import Later
 from rl2grid.engines.native.what_if import WhatIf, forecast_of, snapshot_of
 from rl2grid.mdp.actions import ActionKind, full_catalogue
 
@@ -146,3 +147,49 @@ def test_what_was_moved_cools_down():
     cooled = search._cooled(point, move)
     assert cooled.cooldown_sub[catalogue.target[move]] == env.grid.rules.cooldown_sub
     assert search._cooled(cooled, NOTHING).cooldown_sub[catalogue.target[move]] == env.grid.rules.cooldown_sub - 1
+
+
+def made_heavier(point: Any, factor: float) -> Later:
+    """A moment to come with more demand and production."""
+    nothing = np.zeros(0, np.int32)
+    more = [(values * factor).astype(np.float32) for values in (point.gen_p, point.load_p, point.load_q)]
+    return Later(more[0], more[1], more[2], nothing, nothing, steps=3)
+
+
+def test_what_prepares_for_a_moment_to_come_keeps_the_grid_safe_until_then():
+    """One action is the best that trying all of them finds; several are worth it where one is not enough."""
+    env: Any = gymnasium.make("rl2grid/bus36-M-T1-v0", split="bundled", opponent=False, disable_env_checker=True)
+    env = env.unwrapped
+    env.reset(seed=0, options={"start": 150})
+    search, point = search_of(env), forecast_of(env.engine, 0)
+    assert point is not None
+    lengths = set()
+    for factor in (1.0, 1.2, 1.4, 1.5, 1.6):
+        later = made_heavier(point, factor)
+        found = search.prepared(point, later)
+        now, _ = search.outcomes(point)
+        then, _ = search.outcomes(later.of(point, env.grid))
+        keeps_safe = now.legal & (now.worst_loading < 0.95)
+        least = float(np.where(keeps_safe, then.worst_loading, np.inf).min())
+        lengths.add(found.n_actions)
+        assert found.worst_loading <= search.worst_later(point, later)
+        assert keeps_safe[found.action]
+        if found.n_actions == 1:
+            assert np.isclose(found.worst_loading, least, atol=1e-5)
+        elif found.n_actions > 1:
+            assert found.worst_loading < least - 0.01
+        elif found.worst_loading >= 0.95:
+            assert least > found.worst_loading - 0.02 - 1e-5
+    assert lengths == {0, 1, 3}
+
+
+def test_of_those_that_make_the_grid_safe_the_one_that_stays_so_is_chosen():
+    env = overloaded("bus14-T0", seed=1)
+    search, point = search_of(env, longest=0), forecast_of(env.engine, 0)
+    assert point is not None
+    later = made_heavier(point, 1.1)
+    alone, looking = search.best(point, none(env), NONE), search.best(point, none(env), NONE, later)
+    assert alone.worst_loading < 0.95
+    assert looking.worst_loading < 0.95
+    then = [search.worst_later(search.after(point, found.action), later) for found in (alone, looking)]
+    assert then[1] <= then[0]

@@ -43,7 +43,7 @@ def test_an_agent_whose_rules_changed_says_so_where_they_did():
     assert find_subject("planner@bus14-H0").digest != identity_hash(
         {name: value for name, value in find_subject("planner@bus14-H0").configuration.items() if name != "rules"}
     )
-    assert "rules" not in find_subject("planner@bus14-T0").configuration
+    assert "rules" not in find_subject("greedy@bus14-T0").configuration
     assert "rules" not in find_subject("do-nothing@bus14-R").configuration
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from rl2grid.agents.agent import Action, Agent, Considered, Info, Observation, topology_part
 from rl2grid.agents.planner import Foretold, Planner
-from rl2grid.agents.secure_dispatch import undispatched
+from rl2grid.agents.trend import undispatched
 from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.engines.worlds import World
 from rl2grid.errors import UsageError

@@ -15,8 +15,9 @@ from rl2grid.agents.agent import Action, Considered, Info, Observation, injectin
 from rl2grid.agents.contingencies import NONE, Contingencies, danger, expected, with_certain
 from rl2grid.agents.dispatch import controls, encode, worst_loading
 from rl2grid.agents.greedy_topology import effects
-from rl2grid.agents.secure_dispatch import SecureDispatch, Series, undispatched, with_change
+from rl2grid.agents.secure_dispatch import SecureDispatch, Series, with_change
 from rl2grid.agents.topology_search import NOTHING, SAFE, TopologySearch
+from rl2grid.agents.trend import Later, Trend, later_of, undispatched, without_closing
 from rl2grid.arrays import F32, F64, I32
 from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.engines.native.what_if import WhatIf, forecast_of, snapshot_of
@@ -36,6 +37,7 @@ INGREDIENTS = (
     "prevention",
     "dispatch first",
     "trend",
+    "preparing",
 )
 """What can be left out of the planner, to see what it is worth."""
 _RESTORE_BELOW = 0.93
@@ -76,13 +78,15 @@ class _Moment(NamedTuple):
     safe: bool
     ahead: Snapshot | None  # forecast of the next step before anybody acts; None: the generators cannot follow
     series: Series | None  # of the generators; None where nothing is injected
+    later: Later | None  # what is to come; None where topology does not prepare for it
 
 
 class Planner:
     """Keeps the grid secure by topology, by redispatch, curtailment and storage, or by both in one step.
 
     While the grid is safe, it closes lines, brings substations back where that is safe and makes no outage worse, and
-    shifts power so that no line is overloaded half an hour later by the trend and, where there is an opponent, after no
+    makes ready for half an hour later by the trend and for announced maintenance: by topology where there is nothing
+    else, or it shifts power so that no line is overloaded then and, where there is an opponent, after no
     attack or announced outage (:class:`~rl2grid.agents.secure_dispatch.SecureDispatch`). When it is not safe, it looks
     for the sequence of topology actions that makes it so before protections trip a line
     (:class:`~rl2grid.agents.topology_search.TopologySearch`), and dispatches against what is left; where both can be
@@ -98,7 +102,7 @@ class Planner:
     """
 
     kinds = ("T", "R", "H")
-    rules: ClassVar[Mapping[str, int]] = {"R": 2, "H": 2}
+    rules: ClassVar[Mapping[str, int]] = {"T": 2, "R": 2, "H": 2}
 
     def __init__(self, without: Collection[str] = (), seconds: float | None = None) -> None:
         if isinstance(without, str) or not isinstance(without, Collection):
@@ -132,7 +136,7 @@ class Planner:
         self._env, self._space = base, env.action_space
         self._opened: AsOpened[GridState] = AsOpened()
         self._grid: Grid = base.grid
-        self._what_if = WhatIf(self._grid)
+        self._what_if, self._trend = WhatIf(self._grid), Trend(self._grid)
         self._search: TopologySearch | None = None
         if base.task.changes_topology:
             self._catalogue = full_catalogue(self._grid).take(base.action_catalogue_ids)
@@ -149,6 +153,7 @@ class Planner:
         self._age, self._step = 0, 0
         self._compared: list[tuple[int, float]] = []
         self._topology, self._is_plan_void = NOTHING, False
+        self._trend.reset()
         if self._dispatch is not None:
             self._dispatch.reset()
 
@@ -156,8 +161,7 @@ class Planner:
         """What it plans for the next step."""
         state: GridState = self._env.state
         self._why, self._compared = "", []
-        if self._dispatch is not None:
-            self._dispatch.watch(state)
+        self._trend.watch(state)
         step = int(state.step[0])
         # A heuristic played between, or the environment was brought back to an earlier moment.
         self._is_plan_void |= not self._step <= step <= self._step + 1
@@ -173,7 +177,7 @@ class Planner:
 
     def _choose(self, moment: _Moment) -> Action:
         if moment.safe and self._is_calm(moment):
-            topology = self._restoring(moment)
+            topology = self._preparing(moment) or self._restoring(moment)
             injection = self._preventive(moment, topology) if self._dispatch is not None else None
             return self._action(topology, injection)
         return self._relieve(moment)
@@ -197,8 +201,13 @@ class Planner:
             self._is_plan_void |= topology_part(played) != self._topology
 
     def _moment(self, state: GridState) -> _Moment:
-        series = None if self._dispatch is None else self._series(state)
-        return _Moment(state, is_safe(self._opened(state), 0), forecast_of(self._env.engine, 0), series)
+        ahead, safe = forecast_of(self._env.engine, 0), is_safe(self._opened(state), 0)
+        if self._dispatch is not None:
+            return _Moment(state, safe, ahead, self._series(state), None)
+        if ahead is None or "preparing" in self._without:
+            return _Moment(state, safe, ahead, None, None)
+        ahead = without_closing(state, ahead)
+        return _Moment(state, safe, ahead, None, later_of(state, ahead, self._grid, self._change_per_step()))
 
     def _is_calm(self, moment: _Moment) -> bool:
         """Whether nothing has to be done by the forecast."""
@@ -211,39 +220,62 @@ class Planner:
         outcomes, _ = self._search.outcomes(moment.ahead, np.zeros(1, np.int32))
         return bool(outcomes.worst_loading[NOTHING] < SAFE)
 
+    def _preparing(self, moment: _Moment) -> int:
+        """The entry that begins to make what is to come safe; nothing where it is, or nothing makes it so."""
+        if moment.later is None or moment.ahead is None:
+            return NOTHING
+        assert self._search is not None
+        if self._search.worst_later(moment.ahead, moment.later) < SAFE:
+            return NOTHING
+        found = self._search.prepared(moment.ahead, moment.later)
+        if found.action != NOTHING:
+            self._why = (
+                f"while the grid is safe, it is made ready for what is to come: {found.n_actions} actions lead to a "
+                f"worst loading of {found.worst_loading:.0%} then"
+            )
+        return found.action
+
     def _restoring(self, moment: _Moment) -> int:
         """The entry that closes a line or brings a substation back, if that keeps the grid safe; else nothing."""
         if self._search is None or moment.ahead is None or is_at_reference(moment.state):
             return NOTHING
         effect = effects(self._grid, moment.state, self._catalogue)
         closes = effect.restores & (self._catalogue.kind == ActionKind.SWITCH)
-        point = moment.ahead
-        line = self._best_of(point, np.flatnonzero(closes), SAFE)
+        line = self._best_of(moment, np.flatnonzero(closes), SAFE)
         if line:
             self._why = "while the grid is safe, a line is closed if that keeps it so"
             return line[0]
         if "restoring" in self._without:
             return NOTHING
         homeward = np.flatnonzero(effect.restores & (self._catalogue.kind == ActionKind.MOVE))
-        candidates = self._best_of(point, homeward, _RESTORE_BELOW)
+        candidates = self._best_of(moment, homeward, _RESTORE_BELOW)
         if not candidates:
             return NOTHING
         contingencies = expected(self._grid, moment.state)
-        before = danger(self._what_if, point, contingencies)
+        before = danger(self._what_if, moment.ahead, contingencies)
         for entry in candidates:
-            after = self._search.after(point, entry)
+            after = self._search.after(moment.ahead, entry)
             if danger(self._what_if, after, contingencies) <= before + _DANGER_ADDED:
                 self._why = "while the grid is safe, a substation is brought back if that makes no outage worse"
                 return entry
         return NOTHING
 
-    def _best_of(self, point: Snapshot, entries: NDArray[np.int64], below: float) -> list[int]:
-        """Legal entries after which the worst loading is below a margin, the least loaded first."""
+    def _best_of(self, moment: _Moment, entries: NDArray[np.int64], below: float) -> list[int]:
+        """Legal entries after which the worst loading is below a margin, the least loaded first.
+
+        Later it is to be below as well, or no larger than if nothing were done.
+        """
         if len(entries) == 0:
             return []
         assert self._search is not None
-        outcomes, _ = self._search.outcomes(point, entries.astype(np.int32))
+        assert moment.ahead is not None
+        chosen = entries.astype(np.int32)
+        outcomes, _ = self._search.outcomes(moment.ahead, chosen)
         loading = np.where(outcomes.legal, outcomes.worst_loading, np.inf)
+        if moment.later is not None:
+            later, _ = self._search.outcomes(moment.later.of(moment.ahead, self._grid), chosen)
+            adds = later.worst_loading > self._search.worst_later(moment.ahead, moment.later)
+            loading = np.where(adds, np.maximum(loading, later.worst_loading), loading)
         return [int(entries[k]) for k in np.argsort(loading, kind="stable").tolist() if loading[k] < below]
 
     def _preventive(self, moment: _Moment, topology: int) -> F32 | None:
@@ -285,7 +317,8 @@ class Planner:
                 return self._action(NOTHING, injection)
         topology = NOTHING
         if moment.ahead is not None:
-            found = self._search.best(moment.ahead, moment.state.timestep_overflow[0], self._feared(moment))
+            overflow, feared = moment.state.timestep_overflow[0], self._feared(moment)
+            found = self._search.best(moment.ahead, overflow, feared, moment.later)
             topology, self._compared = found.action, self._search.singles
             self._why = (
                 f"{found.n_actions} actions lead to a worst loading of {found.worst_loading:.0%}"
@@ -310,11 +343,16 @@ class Planner:
         outlook = self._env.engine.outlook(0)
         # An imagined world goes on from forecasts of an earlier step, the last of which repeats.
         past = min(int(state.step[0]) + 1 - outlook.first_step, len(outlook.prod_p) - 1)
-        series = self._dispatch.foreseen(state, outlook.prod_p[past:])
+        series = self._dispatch.foreseen(state, outlook.prod_p[past:], self._trend.per_step())
         foretold = self._foretold_at(state)
         if foretold is not None:
             return with_change(series, foretold.injection - undispatched(state, self._grid))
         return series._replace(trend=np.zeros_like(series.trend)) if "trend" in self._without else series
+
+    def _change_per_step(self) -> F64:
+        """MW more that every element injects in a step, by the trend, float64 [topo]."""
+        change = self._trend.per_step()
+        return np.zeros_like(change) if "trend" in self._without else change
 
     def _injection(self, moment: _Moment, point: Snapshot, topology: int, series: Series) -> F32 | None:
         """The continuous action with a topology action, float32 [continuous]; None: none, or it cannot be followed."""

@@ -23,6 +23,7 @@ from rl2grid.agents.dc_flow import (
 )
 from rl2grid.agents.dispatch import Control, control_positions, controls
 from rl2grid.agents.dispatch_programme import DispatchProgramme
+from rl2grid.agents.trend import LATER, TREND_SHARE
 from rl2grid.arrays import F32, F64, I32
 from rl2grid.engines.native.what_if import WhatIf
 from rl2grid.grids import Grid
@@ -44,10 +45,6 @@ _WATCHED = 0.85
 _NORMAL_WEIGHT, _LATER_WEIGHT = 20.0, 5.0
 """Price of the overload of a line, as a share of its limit, as the grid is, and as it will be by the trend; after an
 outage: the outage's weight."""
-_LATER = 6
-"""Steps ahead at which the grid is watched as well, by the trend."""
-_TREND_SHARE = 0.75
-"""Of a trend that is expected to go on: flows six steps later are met best with it."""
 _PRICE = 2e-4
 """Of a MW of the cheapest control away from rest."""
 _LIMIT_PRICE = 1.0
@@ -58,8 +55,6 @@ _RETURN_SHARE = 0.25
 """Of the ramp of all generators: what returning renewables may ask of it in a step."""
 _HORIZONS = (1, 3, 6, 12)
 """Steps ahead at which generators must be able to follow the series."""
-_TREND = 6
-"""Steps over which the trend is measured that goes on from the last forecast."""
 _RAMP_KEPT = 0.3
 """Share of all ramps that is kept for the next step."""
 _KEPT, _KEPT_PER_STEP = 20.0, 2.0
@@ -114,11 +109,6 @@ class Series(NamedTuple):
     trend: F64  # [topo] MW more injected by each element in a step, by the last half hour
 
 
-class _Seen(NamedTuple):
-    step: int
-    injection: F64  # [topo] MW, as if nothing were dispatched, curtailed or stored
-
-
 class SecureDispatch:
     """Plans what the controls inject in the next step.
 
@@ -132,42 +122,30 @@ class SecureDispatch:
         self._grid, self._network, self._what_if = grid, network, what_if
         self._layout = continuous_layout(grid)
         self._positions = control_positions(grid)
-        self._history: list[_Seen] = []
         self._tables: dict[bytes, F64 | None] = {}
         self._looked: tuple[Snapshot, Series, _Look | None] | None = None
 
     def reset(self) -> None:
-        """Forget the series of the last episode."""
-        self._history.clear()
+        """Forget the last episode."""
         self._looked = None
 
-    def watch(self, state: GridState) -> None:
-        """Remember what the generators produce by the series.
-
-        Who was brought back to an earlier moment, or is asked twice, forgets what was seen from there on.
-        """
-        step = int(state.step[0])
-        before = [seen for seen in self._history if step - _TREND <= seen.step < step]
-        self._history = [*before, _Seen(step, undispatched(state, self._grid))]
-
-    def foreseen(self, state: GridState, forecast: F32) -> Series:
+    def foreseen(self, state: GridState, forecast: F32, change_per_step: F64) -> Series:
         """The series of the redispatchable generators, now and at the horizons of the programme.
 
         Args:
             state: row 0 is the present.
-            forecast: production by the forecasts of the next steps, float32 [step, gen]; later ones follow the trend
-                of the last half hour.
+            forecast: production by the forecasts of the next steps, float32 [step, gen].
+            change_per_step: of all injections by the trend, MW, float64 [topo], which goes on from the last forecast.
         """
         now, gens = self._series_now(state), self._layout.redispatch
-        all_trends = self._trend()
-        trend = all_trends[self._grid.gen_pos_topo_vect[gens]]
+        trend = change_per_step[self._grid.gen_pos_topo_vect[gens]]
         known = forecast[:, gens].astype(np.float64)
         least, most = np.minimum(state.gen_pmin[gens], now), np.maximum(state.gen_pmax[gens], now)
         ahead = [
             known[steps - 1] if steps <= len(known) else np.clip(known[-1] + (steps - len(known)) * trend, least, most)
             for steps in _HORIZONS
         ]
-        return Series(now, np.array(ahead), all_trends)
+        return Series(now, np.array(ahead), change_per_step)
 
     def is_in_use(self, state: GridState) -> bool:
         """Whether generators are dispatched by more than a trifle."""
@@ -250,13 +228,6 @@ class SecureDispatch:
             change[:n_gen][waiting] *= 1.0 - excess / total
         return control.now + change
 
-    def _trend(self) -> F64:
-        """MW more that every element injects in a step, float64 [topo]; zeros where no past is known."""
-        if len(self._history) < 2:
-            return np.zeros(self._grid.dim_topo)
-        first, last = self._history[0], self._history[-1]
-        return (last.injection - first.injection) / (last.step - first.step)
-
     def _series_now(self, state: GridState) -> F64:
         gens = self._layout.redispatch
         series: F64 = state.gen_p[0][gens].astype(np.float64) - state.actual_dispatch[0][gens]
@@ -334,7 +305,7 @@ class SecureDispatch:
 
     def _to_come(self, state: GridState, series: Series) -> F64:
         """MW more that every element will inject some steps later; what is curtailed does not follow its series."""
-        change = _LATER * _TREND_SHARE * series.trend
+        change = LATER * TREND_SHARE * series.trend
         curtailed = state.gen_renewable & (state.gen_p_before_curtail[0] - state.gen_p[0] > _AWAY)
         change[self._grid.gen_pos_topo_vect[curtailed]] = 0.0
         change[self._grid.gen_pos_topo_vect[self._grid.slack_gen]] -= change.sum()
@@ -428,18 +399,9 @@ class SecureDispatch:
                 )
 
 
-def undispatched(state: GridState, grid: Grid) -> F64:
-    """MW that every element would inject if nothing were dispatched, curtailed or stored, float64 [topo]."""
-    series = state.gen_p[0] - state.actual_dispatch[0]
-    injection = np.zeros(grid.dim_topo)
-    injection[grid.gen_pos_topo_vect] = np.where(state.gen_renewable, state.gen_p_before_curtail[0], series)
-    injection[grid.load_pos_topo_vect] = -state.load_p[0].astype(np.float64)
-    return injection
-
-
 def with_change(series: Series, change: F64) -> Series:
     """The series where not the trend but somebody who knows says how all injections will have changed, MW [topo]."""
-    return series._replace(trend=change / (_LATER * _TREND_SHARE))
+    return series._replace(trend=change / (LATER * TREND_SHARE))
 
 
 def _case(weight: float, bound: float, flow: F64, effect: F64, limit: F64) -> _Case:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rl2grid.agents.contingencies import Contingencies, danger
+from rl2grid.agents.trend import Later
 from rl2grid.arrays import F32, F64, I32, Flags
 from rl2grid.engines.native.what_if import ActionOutcomes, WhatIf
 from rl2grid.envs.outages_after_action import point_after
@@ -36,6 +37,12 @@ _TRIPPED = 2.0
 _CASCADE_ROUNDS = 12
 _DANGER = 2.0
 """What the danger of outages counts beside the worst loading, between sequences that make the grid safe."""
+_LONGEST_PREPARATION, _PREPARATION_BEAM = 5, 20
+"""Actions that may prepare for a moment to come, and sequences of them that are gone on from."""
+_ACTION_PRICE = 0.01
+"""What every action of a preparation counts beside the worst loading, and what the first must gain more."""
+_LARGEST_LOADING = 3.0
+"""Up to which the worst loading of a moment to come is told apart."""
 
 
 class Found(NamedTuple):
@@ -79,6 +86,15 @@ class _Step(NamedTuple):
         return self.way.first if self.way.first >= 0 else self.action
 
 
+class _Preparation(NamedTuple):
+    """A sequence of actions in a safe grid, and where it leads."""
+
+    actions: tuple[int, ...]
+    point: Snapshot  # after the last action
+    score: float  # of the moment to come
+    worst: float  # loading then
+
+
 _LOST = Found(NOTHING, np.inf, 0, 0)
 
 
@@ -109,13 +125,14 @@ class TopologySearch:
         """Of the last search: entries of the catalogue that are best as the only action, and their penalty, which is
         the worst loading and more where several lines are overloaded or one would trip; the best first."""
 
-    def best(self, point: Snapshot, overflow: I32, contingencies: Contingencies) -> Found:
+    def best(self, point: Snapshot, overflow: I32, contingencies: Contingencies, later: Later | None = None) -> Found:
         """The first action of the best sequence.
 
         Args:
             point: forecast for the next step before anybody acts; its injections go on.
             overflow: steps that every line has been above its limit, int32 [line].
             contingencies: outages to be ready for, once the grid is safe.
+            later: a moment to come that should be safe as well; None: nothing is known of one.
         """
         until = np.inf if self._seconds is None else time.perf_counter() + self._seconds
         ways = [_Way(-1, point, overflow.astype(np.int32), 0, np.inf, 0.0)]
@@ -129,7 +146,7 @@ class TopologySearch:
                 break
             safe = [step for step in steps if not step.trips and step.way.n_trips == 0 and step.worst < SAFE]
             if safe:
-                return self._safest(safe, depth + 1, contingencies)
+                return self._safest(safe, depth + 1, contingencies, later)
             if entries is None and len(self._catalogue) > _WIDE:
                 entries = np.array(sorted({NOTHING, *(step.action for step in steps[:_WIDE])}), np.int32)
             ways = self._ways(steps, _BEAM[min(depth, len(_BEAM) - 1)])
@@ -139,6 +156,40 @@ class TopologySearch:
             if time.perf_counter() > until:
                 break
         return best
+
+    def prepared(self, point: Snapshot, later: Later) -> Found:
+        """The first action of the best sequence that makes a moment to come safe, and keeps the grid safe until then.
+
+        Doing nothing is found where that moment is safe, or no sequence makes it so much better that it is worth its
+        actions.
+
+        Args:
+            point: forecast for the next step before anybody acts.
+            later: what is expected then.
+        """
+        until = np.inf if self._seconds is None else time.perf_counter() + self._seconds
+        worst = self.worst_later(point, later)
+        best, price = Found(NOTHING, worst, 0, 0), worst - _ACTION_PRICE
+        ways, entries = [_Preparation((), point, worst, worst)], None
+        for depth in range(1, min(later.steps, _LONGEST_PREPARATION) + 1):
+            if best.worst_loading < SAFE or time.perf_counter() > until:
+                break
+            steps = [step for way in ways for step in self._preparations(way, later, entries)]
+            if not steps:
+                break
+            least = min(steps, key=lambda step: step.worst)
+            if least.worst + depth * _ACTION_PRICE < price:
+                price = least.worst + depth * _ACTION_PRICE
+                best = Found(least.actions[0], least.worst, depth, 0)
+            if entries is None and len(self._catalogue) > _WIDE:
+                entries = np.array(sorted({step.actions[0] for step in steps}), np.int32)
+            ways = self._distinct(steps)
+        return best
+
+    def worst_later(self, point: Snapshot, later: Later) -> float:
+        """The worst loading of a moment to come with the topology of an operating point; infinite without a flow."""
+        outcomes, _ = self.outcomes(later.of(point, self._grid), np.zeros(1, np.int32))
+        return float(outcomes.worst_loading[0])
 
     def after(self, point: Snapshot, action: int) -> Snapshot:
         """The operating point after an action."""
@@ -243,18 +294,49 @@ class TopologySearch:
         cooldown[lines] = self._grid.rules.reconnection
         return point._replace(topo_vect=topology, cooldown_line=cooldown)
 
-    def _safest(self, safe: list[_Step], n_actions: int, contingencies: Contingencies) -> Found:
-        """Of the sequences that make the grid safe, the one that outages endanger least."""
-        best = safe[0]
-        if len(contingencies.lines) and len(safe) > 1:
-            candidates = safe[:_CANDIDATES]
-            best = min(
-                candidates,
-                key=lambda step: (
-                    _DANGER * danger(self._what_if, self.after(step.way.point, step.action), contingencies) + step.worst
-                ),
-            )
+    def _safest(self, safe: list[_Step], n_actions: int, contingencies: Contingencies, later: Later | None) -> Found:
+        """Of the sequences that make the grid safe, the one that outages and what is to come endanger least."""
+        if len(safe) == 1 or (later is None and len(contingencies.lines) == 0):
+            return Found(safe[0].first, safe[0].worst, n_actions, 0)
+
+        def penalty(step: _Step) -> float:
+            after = self.after(step.way.point, step.action)
+            to_come = 0.0 if later is None else min(self.worst_later(after, later), _LARGEST_LOADING)
+            return _DANGER * danger(self._what_if, after, contingencies) + max(step.worst, to_come)
+
+        best = min(safe[:_CANDIDATES], key=penalty)
         return Found(best.first, best.worst, n_actions, 0)
+
+    def _preparations(self, way: _Preparation, later: Later, entries: I32 | None) -> list[_Preparation]:
+        """The best next actions by what they make of a moment to come, of those that keep the grid safe until then."""
+        outcomes, rho = self.outcomes(later.of(way.point, self._grid), entries)
+        ids = np.arange(len(self._catalogue), dtype=np.int32) if entries is None else entries
+        playable = outcomes.legal & np.isfinite(outcomes.worst_loading) & (ids != NOTHING)
+        rho[~playable] = 0.0
+        overloads = np.clip(rho - 1.0, 0.0, _LARGEST_OVERLOAD).sum(axis=1)
+        score: F64 = np.where(playable, outcomes.worst_loading + _OVERLOADS * overloads, np.inf).astype(np.float64)
+        most = _WIDE if not way.actions else 2 * _PREPARATION_BEAM
+        order = np.argsort(score, kind="stable")[:most]
+        order = order[np.isfinite(score[order])]
+        if len(order) == 0:
+            return []
+        until_then, _ = self.outcomes(way.point, ids[order])
+        keeps_safe = until_then.legal & (until_then.worst_loading < SAFE)
+        return [
+            _Preparation((*way.actions, int(ids[k])), way.point, float(score[k]), float(outcomes.worst_loading[k]))
+            for k in order[keeps_safe].tolist()
+        ]
+
+    def _distinct(self, steps: list[_Preparation]) -> list[_Preparation]:
+        """The best preparations a step later, each topology once."""
+        ways: dict[bytes, _Preparation] = {}
+        for step in sorted(steps, key=lambda step: step.score):
+            action = step.actions[-1]
+            after = self._cooled(self.after(step.point, action), action)
+            ways.setdefault(after.topo_vect.tobytes(), step._replace(point=after))
+            if len(ways) == _PREPARATION_BEAM:
+                break
+        return list(ways.values())
 
     def _action(self, entry: int) -> StepAction:
         if entry not in self._actions:
