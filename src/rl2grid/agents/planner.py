@@ -225,8 +225,6 @@ class Planner:
         if moment.later is None or moment.ahead is None:
             return NOTHING
         assert self._search is not None
-        if self._search.worst_later(moment.ahead, moment.later) < SAFE:
-            return NOTHING
         found = self._search.prepared(moment.ahead, moment.later)
         if found.action != NOTHING:
             self._why = (
