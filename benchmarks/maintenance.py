@@ -20,43 +20,42 @@ import numpy as np
 
 import rl2grid  # noqa: F401  (registers the tasks)
 from rl2grid.agents.topology_search import TopologySearch
-from rl2grid.agents.trend import later_of
+from rl2grid.agents.trend import ANNOUNCED, later_of
 from rl2grid.engines.native.what_if import WhatIf, forecast_of
 from rl2grid.envs.tasks import find_task
 from rl2grid.evaluation.episode import environment_seed
 from rl2grid.evaluation.protocol import first_months
+from rl2grid.grids import Grid, load_grid
 from rl2grid.mdp.actions import level_catalogue
 from rl2grid.records.files import write_json
 from rl2grid.scenarios.splits import VALIDATION
 
 RESULTS = Path(__file__).resolve().parent / "results" / "maintenance.json"
-BEFORE = 12
-"""Steps before a maintenance at which preparation begins."""
 
 
-def searches(env: Any, levels: list[int]) -> dict[int, TopologySearch]:
+def searches(grid: Grid, levels: list[int]) -> dict[int, TopologySearch]:
     """What prepares with the actions of each level."""
-    what_if = WhatIf(env.grid)
-    return {level: TopologySearch(env.grid, level_catalogue(env.grid, level), what_if) for level in levels}
+    what_if = WhatIf(grid)
+    return {level: TopologySearch(grid, level_catalogue(grid, level), what_if) for level in levels}
 
 
 def starts(env: Any, seed: int) -> list[int]:
     """The steps of a month at which maintenance begins."""
     _, info = env.reset(seed=seed, options={"start": 0})
     length, step, found = int(info["episode_length"]), 0, list[int]()
-    while step < length - BEFORE:
+    while step < length - ANNOUNCED:
         env.reset(seed=seed, options={"start": step})
         until = env.state.time_next_maintenance[0]
         if not (until > 0).any():
             break
         found.append(step + int(until[until > 0].min()))
         step = found[-1]
-    return [start for start in found if start > BEFORE]
+    return [start for start in found if start > ANNOUNCED]
 
 
 def left_by(env: Any, seed: int, start: int, levels: dict[int, TopologySearch]) -> tuple[str, dict[str, float]] | None:
     """The lines whose maintenance begins at a step, and the worst loading without them by who prepares."""
-    env.reset(seed=seed, options={"start": start - BEFORE})
+    env.reset(seed=seed, options={"start": start - ANNOUNCED})
     point = forecast_of(env.engine, 0)
     if point is None:
         return None
@@ -75,10 +74,11 @@ def main() -> None:
     parser.add_argument("--months", type=int, default=40)
     arguments = parser.parse_args()
     task = find_task(arguments.task)
+    levels = searches(load_grid(task.grid_id), arguments.levels)
     found: dict[str, dict[str, Any]] = {}
     for month in first_months(task, VALIDATION, arguments.months):
         env: Any = gymnasium.make(task.id, split="validation", scenario=month, opponent=False).unwrapped
-        levels, seed = searches(env, arguments.levels), environment_seed(month, 0)
+        seed = environment_seed(month, 0)
         for start in starts(env, seed):
             left = left_by(env, seed, start, levels)
             if left is None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rl2grid.arrays import F64, I32
 from rl2grid.engines.native.what_if import OutageOutcomes, WhatIf
@@ -56,6 +57,15 @@ def with_certain(contingencies: Contingencies, lines: I32) -> Contingencies:
     others = ~np.isin(contingencies.lines, lines)
     weight = np.concatenate((np.full(len(lines), _CERTAIN_WEIGHT), contingencies.weight[others]))
     return Contingencies(np.concatenate((lines, contingencies.lines[others])).astype(np.int32), weight)
+
+
+def without_lines(point: Snapshot, grid: Grid, lines: NDArray[np.integer], cooldown: I32 | int) -> Snapshot:
+    """The operating point without some lines, and with the steps for which nobody can close them."""
+    topology, cooldowns = point.topo_vect.copy(), point.cooldown_line.copy()
+    topology[grid.line_or_pos_topo_vect[lines]] = -1
+    topology[grid.line_ex_pos_topo_vect[lines]] = -1
+    cooldowns[lines] = cooldown
+    return point._replace(topo_vect=topology, cooldown_line=cooldowns)
 
 
 def danger(what_if: WhatIf, point: Snapshot, contingencies: Contingencies) -> float:

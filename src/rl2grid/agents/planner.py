@@ -271,9 +271,10 @@ class Planner:
         outcomes, _ = self._search.outcomes(moment.ahead, chosen)
         loading = np.where(outcomes.legal, outcomes.worst_loading, np.inf)
         if moment.later is not None:
-            later, _ = self._search.outcomes(moment.later.of(moment.ahead, self._grid), chosen)
-            adds = later.worst_loading > self._search.worst_later(moment.ahead, moment.later)
-            loading = np.where(adds, np.maximum(loading, later.worst_loading), loading)
+            point = moment.later.of(moment.ahead, self._grid)
+            later, _ = self._search.outcomes(point, np.concatenate(([np.int32(NOTHING)], chosen)))
+            of_nothing, of_chosen = later.worst_loading[0], later.worst_loading[1:]
+            loading = np.where(of_chosen > of_nothing, np.maximum(loading, of_chosen), loading)
         return [int(entries[k]) for k in np.argsort(loading, kind="stable").tolist() if loading[k] < below]
 
     def _preventive(self, moment: _Moment, topology: int) -> F32 | None:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rl2grid.agents.contingencies import Contingencies, danger
+from rl2grid.agents.contingencies import Contingencies, danger, without_lines
 from rl2grid.agents.trend import Later
 from rl2grid.arrays import F32, F64, I32, Flags
 from rl2grid.engines.native.what_if import ActionOutcomes, WhatIf
@@ -223,7 +223,7 @@ class TopologySearch:
         rho[~playable] = 0.0
         overflow = np.where(rho > 1.0, way.overflow[None, :] + 1, 0).astype(np.int32)
         trips: Flags = np.any(self._trips(rho, overflow), axis=1)
-        overloads = np.clip(rho - 1.0, 0.0, _LARGEST_OVERLOAD).sum(axis=1)
+        overloads = _overloads(rho)
         score: F64 = worst + _OVERLOADS * overloads + _TRIP * trips + _TRIPPED * way.n_trips
         order = np.argsort(score, kind="stable")[:most]
         return [
@@ -265,7 +265,7 @@ class TopologySearch:
             if len(tripped) == 0:
                 break
             n_trips += len(tripped)
-            after = self._without(after, tripped)
+            after = without_lines(after, self._grid, tripped, self._grid.rules.reconnection)
             outcomes, all_rho = self.outcomes(after, np.zeros(1, np.int32))
             if outcomes.verdict[0] != 0:
                 return None
@@ -287,13 +287,6 @@ class TopologySearch:
                 sub[change.target] = max(int(sub[change.target]), self._grid.rules.cooldown_sub)
         return point._replace(cooldown_line=line, cooldown_sub=sub)
 
-    def _without(self, point: Snapshot, lines: np.ndarray[tuple[int], np.dtype[np.int64]]) -> Snapshot:
-        topology, cooldown = point.topo_vect.copy(), point.cooldown_line.copy()
-        topology[self._grid.line_or_pos_topo_vect[lines]] = -1
-        topology[self._grid.line_ex_pos_topo_vect[lines]] = -1
-        cooldown[lines] = self._grid.rules.reconnection
-        return point._replace(topo_vect=topology, cooldown_line=cooldown)
-
     def _safest(self, safe: list[_Step], n_actions: int, contingencies: Contingencies, later: Later | None) -> Found:
         """Of the sequences that make the grid safe, the one that outages and what is to come endanger least."""
         if len(safe) == 1 or (later is None and len(contingencies.lines) == 0):
@@ -313,7 +306,7 @@ class TopologySearch:
         ids = np.arange(len(self._catalogue), dtype=np.int32) if entries is None else entries
         playable = outcomes.legal & np.isfinite(outcomes.worst_loading) & (ids != NOTHING)
         rho[~playable] = 0.0
-        overloads = np.clip(rho - 1.0, 0.0, _LARGEST_OVERLOAD).sum(axis=1)
+        overloads = _overloads(rho)
         score: F64 = np.where(playable, outcomes.worst_loading + _OVERLOADS * overloads, np.inf).astype(np.float64)
         most = _WIDE if not way.actions else 2 * _PREPARATION_BEAM
         order = np.argsort(score, kind="stable")[:most]
@@ -342,3 +335,9 @@ class TopologySearch:
         if entry not in self._actions:
             self._actions[entry] = self._catalogue[entry]
         return self._actions[entry]
+
+
+def _overloads(rho: F32) -> F32:
+    """The sum of all overloads, at most so much a line, float32 [action]."""
+    overloads: F32 = np.clip(rho - 1.0, 0.0, _LARGEST_OVERLOAD).sum(axis=1)
+    return overloads

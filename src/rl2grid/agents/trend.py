@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rl2grid.agents.contingencies import without_lines
 from rl2grid.arrays import F32, F64, I32
 from rl2grid.grids import Grid
 from rl2grid.mdp.state import GridState
@@ -17,7 +18,7 @@ TREND_SHARE = 0.75
 """Of a trend that is expected to go on: flows six steps later are met best with it."""
 _PAST = 6
 """Steps over which the trend is measured."""
-_ANNOUNCED = 12
+ANNOUNCED = 12
 """Steps before announced maintenance from which on the grid is looked at without the line."""
 _STEPS_FOR_A_TREND = 3
 """Steps that are left to prepare for what the trend brings."""
@@ -70,17 +71,9 @@ class Later(NamedTuple):
 
     def of(self, point: Snapshot, grid: Grid) -> Snapshot:
         """The operating point then, with the topology and the cooldowns of another one."""
-        topology, cooldown = point.topo_vect.copy(), point.cooldown_line.copy()
-        topology[grid.line_or_pos_topo_vect[self.lost]] = -1
-        topology[grid.line_ex_pos_topo_vect[self.lost]] = -1
-        cooldown[self.lost] = np.maximum(cooldown[self.lost], self.duration)
-        return point._replace(
-            topo_vect=topology,
-            cooldown_line=cooldown,
-            gen_p=self.gen_p,
-            load_p=self.load_p,
-            load_q=self.load_q,
-        )
+        cooldown = np.maximum(point.cooldown_line[self.lost], self.duration)
+        without = without_lines(point, grid, self.lost, cooldown)
+        return without._replace(gen_p=self.gen_p, load_p=self.load_p, load_q=self.load_q)
 
 
 def later_of(state: GridState, point: Snapshot, grid: Grid, change_per_step: F64) -> Later:
@@ -97,14 +90,14 @@ def later_of(state: GridState, point: Snapshot, grid: Grid, change_per_step: F64
     known = np.abs(point.load_p) > _LEAST_LOAD
     ratio = np.divide(load_p, point.load_p, out=np.ones_like(load_p), where=known)
     until = state.time_next_maintenance[0]
-    lost = np.flatnonzero((until > 0) & (until <= _ANNOUNCED) & state.line_status[0]).astype(np.int32)
+    lost = np.flatnonzero((until > 0) & (until <= ANNOUNCED) & state.line_status[0]).astype(np.int32)
     return Later(
         np.maximum(point.gen_p + change[grid.gen_pos_topo_vect], 0.0).astype(np.float32),
         load_p,
         (point.load_q * np.clip(ratio, _LEAST_RATIO, _MOST_RATIO)).astype(np.float32),
         lost,
         state.duration_next_maintenance[0][lost].astype(np.int32),
-        int(until[lost].min(initial=_ANNOUNCED)) if len(lost) else _STEPS_FOR_A_TREND,
+        int(until[lost].min()) if len(lost) else _STEPS_FOR_A_TREND,
     )
 
 
