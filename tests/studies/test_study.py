@@ -22,17 +22,23 @@ from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import AGENTS, make_agent
 from rl2grid.records.files import write_json
+from rl2grid.records.labels import read_labels_description
 from rl2grid.records.locks import is_locked
+from rl2grid.records.studies import read_result
 from rl2grid.studies import run as study_run
 from rl2grid.studies.backends import Local, Slurm
-from rl2grid.studies.cell import BUSY, FAILED, FINISHED, REFUSED, CellResult, prepare
+from rl2grid.studies.cell import BUSY, FAILED, FINISHED, REFUSED, CellResult, commands, prepare, run_cell
 from rl2grid.studies.cells import cell_from_dict, cell_to_dict
 from rl2grid.studies.run import run_study
 from rl2grid.studies.states import State, read_states
 from rl2grid.studies.study import included_studies, parse_study
 from rl2grid.studies.toml_file import read_toml
+from rl2grid.training.teaching import Taught, teach
 
 GROUP: dict[str, Any] = {"algorithms": ["ppo"], "tasks": ["bus14-T0"]}
+
+
+PUPIL = {"algorithms": ["imitation"], "teacher": "greedy", "rounds": [2, 2]}
 
 
 def contents(**changes: Any) -> dict[str, Any]:
@@ -106,6 +112,12 @@ def test_hyperparameters_are_those_of_all_then_those_of_one_algorithm():
         ({"preset": ["a"]}, "Group 1 needs preset, a text in quotation marks"),
         ({"seeds": [1, 1]}, "Cell bus14-T0-v0-ppo-1 is listed twice"),
         ({"name": "a/b"}, "name may contain letters"),
+        ({"group": {"algorithms": ["imitation"]}}, "trains imitation: give teacher, an agent, and rounds"),
+        ({"group": {**PUPIL, "teacher": "greed"}}, "(did you mean 'greedy'?)"),
+        ({"group": {**PUPIL, "teacher": "dc-opf"}}, "agent 'dc-opf' cannot play"),
+        ({"group": {**PUPIL, "rounds": 20}}, "rounds must be a list such as [200, 200], not 20"),
+        ({"group": {**PUPIL, "rounds": [20, 0]}}, "each of rounds must be a whole number of at least 1, not 0"),
+        ({"group": {**PUPIL, "hyperparameters": {"labels": ["some"]}}}, "has labels and a teacher"),
     ],
 )
 def test_a_bad_file_is_refused_in_one_sentence(changes: dict[str, Any], part: str):
@@ -168,6 +180,39 @@ def test_a_cell_survives_its_file(tmp_path: Path):
     (other,) = parse_study(contents(group=group, budget=2048)).cells
     with pytest.raises(UsageError, match="another training"):
         prepare(tmp_path, other)
+
+
+def test_a_pupil_is_labelled_for_in_rounds_and_goes_on_after_an_interruption(tmp_path: Path, monkeypatch):
+    group = {
+        **PUPIL,
+        "environment": {"episode_length": 288},
+        "hyperparameters": {"num_steps": 1024, "actor_layers": [8]},
+    }
+    (cell,) = parse_study(contents(group=group, budget=2048, split="validation", validations=1)).cells
+    assert cell_from_dict(json.loads(json.dumps(cell_to_dict(cell)))) == cell
+    prepare(tmp_path / "whole", cell)
+    run_cell(tmp_path / "whole")
+    labels = read_labels_description(tmp_path / "whole" / "labels")
+    assert [(each["months"], each["pupil"] is None) for each in labels["rounds"]] == [(2, True), (2, False)]
+
+    def stop_at_the_second_round(*words: Any, pupil: Path | None, **keywords: Any) -> Taught:
+        if pupil is not None:
+            raise KeyboardInterrupt
+        return teach(*words, pupil=pupil, **keywords)
+
+    prepare(tmp_path / "stopped", cell)
+    with monkeypatch.context() as patch:
+        patch.setattr("rl2grid.studies.cell.teach", stop_at_the_second_round)
+        with pytest.raises(KeyboardInterrupt):
+            run_cell(tmp_path / "stopped")
+    assert (tmp_path / "stopped" / "pupil-1").exists()
+    run_cell(tmp_path / "stopped")
+    whole, stopped = (read_result(tmp_path / name) for name in ("whole", "stopped"))
+    assert whole is not None
+    assert stopped is not None
+    assert whole.survival == stopped.survival
+    words = commands(tmp_path / "whole", cell)
+    assert [line.split()[1] for line in words] == ["teach", "train", "teach", "train", "evaluate"]
 
 
 class FakeBackend:

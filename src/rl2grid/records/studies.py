@@ -4,7 +4,8 @@
 
     study.json        cells, states, commands, identity hashes, minutes
     episodes.csv      all evaluated episodes of the finished cells
-    cells/<cell>/     ``cell.json``, ``run/``, ``evaluation/`` and, at the very end, ``result.json``
+    cells/<cell>/     ``cell.json``, ``run/``, ``evaluation/`` and, at the very end, ``result.json``; where a teacher
+                      labels what is learned from, before them ``labels/`` and ``pupil-1/``, ``pupil-2/``, ...
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from rl2grid.records.files import read_json, write_record, write_text
 
 STUDY_FILE, CELLS_FOLDER = "study.json", "cells"
 CELL_FILE, RESULT_FILE = "cell.json", "result.json"
-RUN_FOLDER, EVALUATION_FOLDER = "run", "evaluation"
+RUN_FOLDER, EVALUATION_FOLDER, LABELS_FOLDER = "run", "evaluation", "labels"
 _PART, _REMEDY = "a part of a study", "remove it, and the study makes it again"
 _CELL = {
     "name": str,
@@ -67,6 +68,11 @@ def write_cell(folder: Path, cell: Mapping[str, Any]) -> None:
     """Make the folder of a cell."""
     folder.mkdir(parents=True, exist_ok=True)
     write_record(folder / CELL_FILE, dict(cell))
+
+
+def training_folders(folder: Path, n_rounds: int) -> list[Path]:
+    """The run folders of a cell, in order: a pupil for each round of labels but the last, then the run."""
+    return [*(folder / f"pupil-{number}" for number in range(1, n_rounds)), folder / RUN_FOLDER]
 
 
 def is_cell_finished(folder: Path) -> bool:

@@ -3,6 +3,8 @@
 A cell's folder holds
 
 - ``cell.json``: what is asked for;
+- ``labels/`` and ``pupil-1/``, ``pupil-2/``, ...: what a teacher labelled, see :mod:`rl2grid.training.teaching`, and
+  the pupils of all rounds but the last, on whose states the next round is labelled;
 - ``run/``: the training run, if the agent learns, see :mod:`rl2grid.training.runs`;
 - ``evaluation/``: the episodes, see :mod:`rl2grid.evaluation.protocol`;
 - ``log.txt``: what its processes printed, see :mod:`rl2grid.records.logs`;
@@ -16,16 +18,19 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
 import threading
 import traceback
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
+from rl2grid.envs.tasks import short_id
 from rl2grid.errors import UsageError
-from rl2grid.evaluation.flags import evaluate_command
+from rl2grid.evaluation.flags import environment_flags, evaluate_command
 from rl2grid.evaluation.protocol import evaluate
 from rl2grid.records.locks import LockedError, locked
 from rl2grid.records.logs import last_line, open_log
@@ -33,10 +38,11 @@ from rl2grid.records.metrics import trained_seconds
 from rl2grid.records.studies import (
     CELL_FILE,
     EVALUATION_FOLDER,
-    RUN_FOLDER,
+    LABELS_FOLDER,
     CellResult,
     read_cell,
     read_result,
+    training_folders,
     write_cell,
     write_result,
 )
@@ -44,6 +50,7 @@ from rl2grid.scenarios.splits import VALIDATION_MONTHS
 from rl2grid.studies.cells import Cell, Training, cell_from_dict, cell_to_dict
 from rl2grid.training import request, runs
 from rl2grid.training.commands import train_command
+from rl2grid.training.teaching import teach
 from rl2grid.training.validation import validator
 
 FINISHED, FAILED, REFUSED, BUSY, STOPPED = 0, 1, 2, 75, 130
@@ -75,10 +82,22 @@ def commands(folder: Path, cell: Cell) -> list[str]:
     """What to type to obtain the cell by hand."""
     keywords, lines, agent = {"heuristic": cell.heuristic, **cell.environment}, [], cell.agent
     if cell.training is not None:
-        run = folder / RUN_FOLDER
-        lines = [train_command(_run_args(cell, cell.training, run), cell.training.preset, run)]
-        agent = str(run)
+        trainings = training_folders(folder, len(cell.training.rounds))
+        for number, run in enumerate(trainings):
+            lines += _teach_command(cell, cell.training, folder, number)
+            lines.append(train_command(_run_args(cell, cell.training, run), cell.training.preset, run))
+        agent = str(trainings[-1])
     return [*lines, evaluate_command(agent, cell.task, cell.split, cell.evaluation_seeds, cell.months, keywords)]
+
+
+def _teach_command(cell: Cell, training: Training, folder: Path, number: int) -> list[str]:
+    if training.lessons is None:
+        return []
+    words = ["rl2grid", "teach", training.lessons.teacher, short_id(cell.task.id)]
+    words += ["--months", str(training.rounds[number]), "--seed", str(training.seed)]
+    words += ["--pupil", str(folder / f"pupil-{number}")] if number else []
+    words += environment_flags({"heuristic": cell.heuristic, **cell.environment})
+    return [shlex.join([*words, "--output", str(folder / LABELS_FOLDER)])]
 
 
 def run_cell(folder: Path) -> None:
@@ -100,11 +119,13 @@ def _finish(folder: Path) -> None:
         raise UsageError(f"{folder} holds no cell: there is no {CELL_FILE} in it.")
     cell = cell_from_dict(stored)
     agent: str | Path = cell.agent
+    trainings: list[Path] = []
     if cell.training is not None:
-        agent = folder / RUN_FOLDER
-        _train(cell, cell.training, folder / RUN_FOLDER)
-        if not runs.is_finished(folder / RUN_FOLDER):
-            raise KeyboardInterrupt
+        trainings = training_folders(folder, len(cell.training.rounds))
+        for number, run in enumerate(trainings):
+            _teach(cell, cell.training, folder, number)
+            _train(cell, cell.training, run)
+        agent = trainings[-1]
     result = evaluate(
         agent,
         cell.task,
@@ -117,7 +138,7 @@ def _finish(folder: Path) -> None:
         command=commands(folder, cell)[-1],
         **cell.environment,
     )
-    seconds = trained_seconds(folder / RUN_FOLDER) + sum(episode.wall_time_s for episode in result.episodes)
+    seconds = sum(map(trained_seconds, trainings)) + sum(episode.wall_time_s for episode in result.episodes)
     summary = CellResult(
         minutes=round(seconds / 60.0, 2),
         identity=result.episodes[0].identity,
@@ -127,23 +148,50 @@ def _finish(folder: Path) -> None:
     write_result(folder, summary)
 
 
-def _train(cell: Cell, training: Training, folder: Path) -> None:
-    if folder.exists():
-        if not runs.is_finished(folder):
-            runs.resume(folder, evaluate=validator(request.read_config(folder)[0]))
+def _teach(cell: Cell, training: Training, folder: Path, number: int) -> None:
+    """Label a round, or what is missing of it."""
+    if training.lessons is None:
         return
-    args = _run_args(cell, training, folder)
-    runs.train(args, evaluate=validator(args))
+    teach(
+        training.lessons.teacher,
+        cell.task,
+        months=training.rounds[number],
+        output=folder / LABELS_FOLDER,
+        seed=training.seed,
+        heuristic=cell.heuristic,
+        pupil=training_folders(folder, len(training.rounds))[number - 1] if number else None,
+        gamma=training.resolved(cell.task).gamma,
+        workers=0,
+        command=_teach_command(cell, training, folder, number)[0],
+        **cell.environment,
+    )
 
 
-def _run_args(cell: Cell, training: Training, folder: Path) -> request.RunArgs:
+def _train(cell: Cell, training: Training, run: Path) -> None:
+    """Train, or go on.
+
+    Raises:
+        KeyboardInterrupt: it was asked to stop before the end.
+    """
+    if not run.exists():
+        args = _run_args(cell, training, run)
+        runs.train(args, evaluate=validator(args))
+    elif not runs.is_finished(run):
+        runs.resume(run, evaluate=validator(request.read_config(run)[0]))
+    if not runs.is_finished(run):
+        raise KeyboardInterrupt
+
+
+def _run_args(cell: Cell, training: Training, run: Path) -> request.RunArgs:
     hyperparameters = training.resolved(cell.task)
+    if training.lessons is not None:
+        hyperparameters = replace(hyperparameters, labels=(str(run.parent / LABELS_FOLDER),))
     native = cell.environment.get("engine", "native") == "native"
     return request.RunArgs(
         task=cell.task,
         hyperparameters=hyperparameters,
         algorithm=training.algorithm,
-        folder=folder,
+        folder=run,
         env_keywords={"heuristic": cell.heuristic, **cell.environment},
         num_threads=1 if native else None,
         num_workers=None if native else 0,

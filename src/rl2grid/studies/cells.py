@@ -17,6 +17,15 @@ from rl2grid.training import request
 
 
 @dataclass(frozen=True)
+class Lessons:
+    """Who labels what imitation learns from, with rounds on the states that the pupil meets (DAgger)."""
+
+    teacher: str
+    rounds: tuple[int, ...]
+    """Training months of each round: the teacher plays the first, the pupil of the round before the others."""
+
+
+@dataclass(frozen=True)
 class Training:
     """What a cell learns before it is evaluated."""
 
@@ -27,9 +36,16 @@ class Training:
     """Changes of the preset, the budget (``total_timesteps``) among them."""
     validations: int
     """Evaluations on the validation scenarios, spread evenly over the budget."""
+    lessons: Lessons | None
+    """What is labelled before it learns, for this cell alone; None: nothing."""
+
+    @property
+    def rounds(self) -> tuple[int, ...]:
+        """Months of each round of labels; empty where nothing is labelled."""
+        return self.lessons.rounds if self.lessons else ()
 
     def resolved(self, task: Task) -> Hyperparameters:
-        """All hyperparameters.
+        """All hyperparameters, but for the folder of labels that the cell makes.
 
         Raises:
             UsageError: they cannot work, or not for this task.
@@ -105,6 +121,8 @@ def cell_from_dict(stored: Mapping[str, Any]) -> Cell:
 def _cell_from_dict(stored: Mapping[str, Any]) -> Cell:
     cell = {**stored, "task": find_task(stored["task"]), "environment": with_tuples(stored["environment"])}
     if cell["training"] is not None:
-        training = cell["training"]
+        training = dict(cell["training"])
+        if training["lessons"] is not None:
+            training["lessons"] = Lessons(**with_tuples(training["lessons"]))
         cell["training"] = Training(**{**training, "hyperparameters": with_tuples(training["hyperparameters"])})
     return Cell(**cell)

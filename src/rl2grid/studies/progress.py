@@ -81,7 +81,11 @@ def _best(state: CellState) -> str:
 
 
 def _stage(state: CellState) -> str:
-    return f"{state.tail.decisions:,} of {state.decisions:,}" if state.decisions else "evaluation"
+    if not state.decisions:
+        return "evaluation"
+    if state.tail.decisions == 0 and state.rounds:
+        return f"labels and pupils, round {state.pupils + 1} of {state.rounds}"
+    return f"{state.tail.decisions:,} of {state.decisions:,}"
 
 
 def _duration(seconds: float) -> str:

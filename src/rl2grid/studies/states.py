@@ -10,11 +10,13 @@ from rl2grid.records.locks import is_locked
 from rl2grid.records.metrics import METRICS_FILE, MetricsTail
 from rl2grid.records.studies import (
     EVALUATION_FOLDER,
+    LABELS_FOLDER,
     RUN_FOLDER,
     CellResult,
     played_episodes,
     read_result,
     read_study,
+    training_folders,
 )
 from rl2grid.studies.cells import Cell, Study
 
@@ -55,7 +57,21 @@ class CellState:
     @property
     def work(self) -> float:
         """Size of the cell, in decisions."""
-        return float(self.decisions or _AGENT_WORK)
+        return float(len(self._trainings) * self.decisions or _AGENT_WORK)
+
+    @property
+    def rounds(self) -> int:
+        """Rounds of labels that it learns from."""
+        return len(self.cell.training.rounds) if self.cell.training else 0
+
+    @property
+    def _trainings(self) -> list[Path]:
+        return training_folders(self.folder, self.rounds)
+
+    @property
+    def pupils(self) -> int:
+        """Pupils that were begun, each after its round of labels."""
+        return sum(pupil.exists() for pupil in self._trainings[:-1])
 
     @property
     def share(self) -> float:
@@ -63,7 +79,7 @@ class CellState:
         if self.result is not None:
             return 1.0
         if self.decisions:
-            return min(self.tail.decisions / self.decisions, 1.0)
+            return (self.pupils + min(self.tail.decisions / self.decisions, 1.0)) / len(self._trainings)
         return min(played_episodes(self.folder) / self.episodes, 1.0)
 
     @property
@@ -93,7 +109,7 @@ def look(state: CellState) -> None:
         state.state = State.DONE
     elif is_locked(state.folder):
         state.state = State.RUNNING
-    elif (state.folder / RUN_FOLDER).exists() or (state.folder / EVALUATION_FOLDER).exists():
+    elif any((state.folder / begun).exists() for begun in (RUN_FOLDER, EVALUATION_FOLDER, LABELS_FOLDER)):
         state.state = State.STOPPED
     else:
         state.state = State.WAITING

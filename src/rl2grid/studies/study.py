@@ -38,7 +38,7 @@ from rl2grid.evaluation.agents import AGENTS, kinds_of
 from rl2grid.evaluation.protocol import first_months
 from rl2grid.mdp.rewards import resolve_reward
 from rl2grid.scenarios.splits import SPLITS
-from rl2grid.studies.cells import Cell, Study, Training
+from rl2grid.studies.cells import Cell, Lessons, Study, Training
 from rl2grid.studies.toml_file import (
     as_table,
     check_kind,
@@ -56,12 +56,25 @@ from rl2grid.training import request
 NO_HEURISTIC = "none"
 DEFAULT_RETRIES = 2
 DEFAULT_VALIDATIONS = 10
+IMITATION = "imitation"
+"""The algorithm that learns from a teacher."""
 
 _ACTIONS = {"T": "discrete", "R": "continuous", "H": "joint"}
 
 _STUDY_KEYS = ("name", "output", "retries", "scale", "group", "slurm")
 _PRODUCT_KEYS = ("label", "algorithms", "agents", "tasks", "heuristics", "hyperparameters", "environment")
-_SETTINGS = ("split", "preset", "reward", "seeds", "budget", "validations", "months", "evaluation_seeds")
+_SETTINGS = (
+    "split",
+    "preset",
+    "reward",
+    "seeds",
+    "budget",
+    "validations",
+    "months",
+    "evaluation_seeds",
+    "teacher",
+    "rounds",
+)
 """May stand in a group, a scale or the study, and count in this order."""
 
 
@@ -147,7 +160,7 @@ class _Group:
                 self._check_agent(agent, task)
                 yield self._cell(agent, task, heuristic, None)
             for algorithm, seed in itertools.product(algorithms, self._seeds() if algorithms else ()):
-                yield self._cell(algorithm, task, heuristic, self._training(algorithm, seed))
+                yield self._cell(algorithm, task, heuristic, self._training(algorithm, seed, task))
 
     def _cell(self, agent: str, task: Task, heuristic: str, training: Training | None) -> Cell:
         label = text(self.where, self.table, "label", "")
@@ -178,14 +191,34 @@ class _Group:
             raise UsageError(f"{upper(self.where)}: {error}") from None
         return cell
 
-    def _training(self, algorithm: str, seed: int) -> Training:
+    def _training(self, algorithm: str, seed: int, task: Task) -> Training:
         changes = self._changes(algorithm)
         budget = self._setting("budget", None)
         if budget is not None:
             changes["total_timesteps"] = count(self.where, "budget", budget, 1)
         preset = text(self.where, {"preset": self._setting("preset", "default")}, "preset")
         validations = count(self.where, "validations", self._setting("validations", DEFAULT_VALIDATIONS), 1)
-        return Training(algorithm, seed, preset, changes, validations)
+        lessons = self._lessons(task, changes) if algorithm == IMITATION else None
+        return Training(algorithm, seed, preset, changes, validations, lessons)
+
+    def _lessons(self, task: Task, changes: Mapping[str, Any]) -> Lessons | None:
+        """What imitation learns from: a teacher's labels, unless there are folders of labels."""
+        teacher, rounds = self._setting("teacher", None), self._setting("rounds", None)
+        if "labels" in changes:
+            if "teacher" in self.table:
+                raise UsageError(f"{upper(self.where)} has labels and a teacher, who would label again: leave out one.")
+            return None
+        if teacher is None or rounds is None:
+            raise UsageError(
+                f"{upper(self.where)} trains imitation: give teacher, an agent, and rounds, the months of each round "
+                "of labels such as [200, 200], or hyperparameters.labels, folders that 'rl2grid teach' wrote."
+            )
+        if teacher not in AGENTS:
+            raise unknown(f"{upper(self.where)}: teacher", teacher, list(AGENTS))
+        self._check_agent(teacher, task)
+        if not isinstance(rounds, list) or not rounds:
+            raise UsageError(f"{upper(self.where)}: rounds must be a list such as [200, 200], not {rounds!r}.")
+        return Lessons(teacher, tuple(count(self.where, "each of rounds", months, 1) for months in rounds))
 
     def _changes(self, algorithm: str) -> dict[str, Any]:
         """Hyperparameters of the group: those of all its algorithms, then those of this one."""
