@@ -4,23 +4,22 @@
 plays the first N validation months of each task (after the first ``--skip``), by default without a heuristic, with the
 planner, with the agents of ``--against``, and, with ``--without``, with the planner without each of its ingredients. It
 writes ``benchmarks/results/planner.json``, one row per task and agent: survival with its interval, paired difference to
-the planner, share of completed months, milliseconds of a decision (mean, 99 of 100, the slowest), how episodes ended
-and which lines were overloaded then. Tasks and heuristics that were measured before stay.
+the planner, share of completed months, milliseconds of processor time of a decision (mean, 99 of 100, the slowest),
+how episodes ended and which lines were overloaded then. Tasks and heuristics that were measured before stay.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import time
 from collections import Counter
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import numpy as np
+from timed import Timed
 
-from rl2grid.agents.agent import Action, Agent, Info, Observation
+from rl2grid.agents.agent import Agent
 from rl2grid.agents.planner import INGREDIENTS, Planner
 from rl2grid.envs.tasks import Task, find_task, short_id
 from rl2grid.evaluation.agents import make_agent
@@ -31,26 +30,6 @@ from rl2grid.records.statistics import Scores
 from rl2grid.scenarios.splits import VALIDATION
 
 RESULTS = Path(__file__).resolve().parent / "results" / "planner.json"
-
-
-class Timed:
-    """An agent, and how long its decisions took."""
-
-    def __init__(self, agent: Agent) -> None:
-        self._agent, self.name = agent, agent.name
-        self.seconds: list[float] = []
-
-    def bind(self, env: gymnasium.Env[Any, Any]) -> None:
-        self._agent.bind(env)
-
-    def reset(self, i: int) -> None:
-        self._agent.reset(i)
-
-    def act(self, observation: Observation, info: Info) -> Action:
-        began = time.perf_counter()
-        action = self._agent.act(observation, info)
-        self.seconds.append(time.perf_counter() - began)
-        return action
 
 
 def measured(agent: Agent, task: Task, months: tuple[str, ...], heuristic: str | None) -> tuple[dict[str, Any], Scores]:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import time
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +18,9 @@ os.environ["OMP_NUM_THREADS"] = "1"
 
 import numpy as np
 from gains import compared, survival_behind
+from timed import Timed
 
 import rl2grid
-from rl2grid.agents.agent import Agent
 from rl2grid.envs.tasks import find_task
 from rl2grid.evaluation.agents import make_agent
 from rl2grid.records.files import write_json
@@ -30,31 +29,13 @@ from rl2grid.records.versions import processor
 RESULTS = Path(__file__).resolve().parent / "results" / "top_k.json"
 
 
-class Timed:
-    """An agent whose decisions are timed."""
-
-    def __init__(self, agent: Agent) -> None:
-        self._agent = agent
-        self.seconds, self.decisions = 0.0, 0
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._agent, name)
-
-    def act(self, observation: Any, info: Any) -> Any:
-        """The agent's action."""
-        began = time.process_time()
-        action = self._agent.act(observation, info)
-        self.seconds += time.process_time() - began
-        self.decisions += 1
-        return action
-
-
 def play(run: str, k: int, months: int) -> tuple[list[float], dict[str, Any]]:
     """Survival of each month, and what decisions cost."""
     policy = rl2grid.load(run)
     agent = Timed(policy if k == 1 else make_agent(run, find_task(policy.task), top_k=k))
     survival = survival_behind(agent, policy.task, months)
-    return survival, {"decisions": agent.decisions, "microseconds": round(1e6 * agent.seconds / agent.decisions, 1)}
+    microseconds = 1e6 * float(np.mean(agent.seconds))
+    return survival, {"decisions": len(agent.seconds), "microseconds": round(microseconds, 1)}
 
 
 def main() -> None:

@@ -1,0 +1,94 @@
+"""What a decision costs, and how many there are in a month: agents on the same validation months, one thread.
+
+``python benchmarks/decision_time.py TASK AGENT[:HEURISTIC] ... [--top-k K] [--months N] [--skip N]`` plays validation
+months of a task, by default ten behind those by which policies were picked, with each agent: ``planner``,
+``greedy:careful``, a run folder or ``pretrained/NAME`` (with the heuristic of its training), and, with ``--top-k``,
+the best K of every policy. It adds to ``benchmarks/results/decision_time.json`` a row for each: survival, decisions a
+month, milliseconds of processor time of a decision (mean, median, 99 of 100) and seconds of them in a month of 8,064
+steps that were played.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+os.environ["OPENBLAS_NUM_THREADS"] = "1"
+os.environ["OMP_NUM_THREADS"] = "1"
+
+import numpy as np
+from gains import CHOSEN_ON
+from timed import Timed
+
+from rl2grid.agents.agent import Agent
+from rl2grid.envs.tasks import Task, find_task, short_id
+from rl2grid.evaluation.agents import AGENTS, make_agent
+from rl2grid.evaluation.protocol import AS_TRAINED, evaluate, first_months
+from rl2grid.records.files import write_json
+from rl2grid.records.versions import processor
+from rl2grid.scenarios.splits import VALIDATION
+
+RESULTS = Path(__file__).resolve().parent / "results" / "decision_time.json"
+STEPS_OF_A_MONTH = 8064
+
+
+def row_of(agent: Agent, task: Task, heuristic: str | None, months: tuple[str, ...]) -> dict[str, Any]:
+    """Play, and say what decisions took."""
+    timed = Timed(agent)
+    played = evaluate(timed, task, scenarios=months, heuristic=heuristic, workers=0, progress=True)
+    milliseconds = 1e3 * np.array(timed.seconds)
+    per_month = STEPS_OF_A_MONTH / sum(episode.grid_steps for episode in played.episodes)
+    return {
+        "survival": round(played.summary.survival.value, 4),
+        "decisions_a_month": round(len(milliseconds) * per_month, 1),
+        "milliseconds": [
+            round(float(each), 3)
+            for each in (milliseconds.mean(), np.median(milliseconds), np.quantile(milliseconds, 0.99))
+        ],
+        "seconds_a_month": round(float(milliseconds.sum()) / 1e3 * per_month, 3),
+    }
+
+
+def players(words: list[str], task: Task, top_k: int | None) -> dict[str, tuple[Agent, str | None]]:
+    """Agents and heuristics by the names of their rows."""
+    found: dict[str, tuple[Agent, str | None]] = {}
+    for word in words:
+        name, _, heuristic = word.partition(":")
+        if name in AGENTS:
+            found[word] = make_agent(name, task), heuristic or None
+            continue
+        found[name] = make_agent(name, task), AS_TRAINED
+        if top_k is not None:
+            found[f"{name}, best of {top_k}"] = make_agent(name, task, top_k=top_k), AS_TRAINED
+    return found
+
+
+def main() -> None:
+    """Play what is asked for, and write the rows beside those of before."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("task", metavar="TASK")
+    parser.add_argument("agents", nargs="+", metavar="AGENT")
+    parser.add_argument("--top-k", type=int, default=None)
+    parser.add_argument("--months", type=int, default=10)
+    parser.add_argument("--skip", type=int, default=CHOSEN_ON)
+    arguments = parser.parse_args()
+    task = find_task(arguments.task)
+    months = first_months(task, VALIDATION, arguments.skip + arguments.months)[arguments.skip :]
+    rows: dict[str, Any] = {}
+    for name, (agent, heuristic) in players(arguments.agents, task, arguments.top_k).items():
+        rows[name] = row_of(agent, task, heuristic, months)
+        print(short_id(task.id), name, json.dumps(rows[name]), flush=True)
+    results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+    results[short_id(task.id)] = {
+        "processor": processor(),
+        "months": [arguments.skip, arguments.skip + len(months)],
+        "rows": rows,
+    }
+    write_json(RESULTS, results, indent=1)
+
+
+if __name__ == "__main__":
+    main()
