@@ -125,6 +125,16 @@ def test_what_a_training_learned_from_counts_by_content_and_seeds_are_one_choice
     assert choice_hash(found[0]) != choice_hash(found[0] | {"labels": {"labels": ["bad"]}})
 
 
+def test_labels_of_as_many_other_months_repeat_a_training_and_choose_nothing():
+    def learned_from(contents: str, months: list[int]) -> dict[str, Any]:
+        labels = {"teacher": "greedy", "rounds": 2, "months": [months], "labels": [contents], "grid_hash": "0"}
+        return {"algorithm": "imitation", **subjects._learned_from({"labels": labels})}
+
+    first, other, fewer = learned_from("f00", [20, 20]), learned_from("bad", [20, 20]), learned_from("f00", [20, 10])
+    assert first != other
+    assert choice_hash(first) == choice_hash(other) != choice_hash(fewer)
+
+
 def test_a_configuration_is_tested_once_and_verified_as_often_as_asked(played, tmp_path: Path, capsys):
     ledger = tmp_path / "ledger.json"
     words = ["greedy@bus14-T0", "--ledger", str(ledger)]

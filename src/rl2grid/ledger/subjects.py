@@ -23,6 +23,7 @@ from rl2grid.records.trainings import read_training_run
 from rl2grid.scenarios.library import split_version
 from rl2grid.scenarios.splits import TEST
 
+_OF_LABELS = ("teacher", "rounds", "months", "labels")
 _PLACES = ("labels", "start_from")
 """Hyperparameters that are paths: what lies there is what counts."""
 
@@ -165,7 +166,7 @@ def _learned_from(identity: Mapping[str, Any]) -> dict[str, Any]:
     """By content: which labels a training learned from, and which policy it began with; empty where there are none."""
     found: dict[str, Any] = {}
     if "labels" in identity:
-        found["labels"] = {name: identity["labels"][name] for name in ("teacher", "rounds", "labels")}
+        found["labels"] = {name: value for name, value in identity["labels"].items() if name in _OF_LABELS}
     if "start" in identity:
         found[STARTED_FROM] = {name: identity["start"][name] for name in ("algorithm", "decisions", "policy_hash")}
     return found

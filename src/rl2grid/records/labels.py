@@ -186,8 +186,8 @@ class LabelsDescription:
     rows: tuple[MonthRow, ...]
     """The months, in the order of their labels."""
     identity: Mapping[str, Any]
-    """``grid_hash``, ``action_set_hash``, ``observation_size``, ``versions``, and the hash of each folder's labels in
-    ``labels``."""
+    """``grid_hash``, ``action_set_hash``, ``observation_size``, ``versions``, and of each folder the months of its
+    rounds in ``months`` and the hash of its labels in ``labels``."""
 
 
 def label_shape(task: Task, candidates: int, operator_features: str | None = None) -> LabelShape:
@@ -273,8 +273,20 @@ def read_labels(folders: Sequence[Path], task_id: str) -> tuple[LabelsDescriptio
         months=len(parts),
         rows=tuple(row for row, _ in parts),
         rounds=max(len(each["rounds"]) for each in descriptions),
-        identity={**first["identity"], "labels": [checksum(each) for each in descriptions]},
+        identity={
+            **first["identity"],
+            "months": [[each["months"] for each in description["rounds"]] for description in descriptions],
+            "labels": [checksum(each) for each in descriptions],
+        },
     ), labels
+
+
+def chosen_of_labels(identity: Mapping[str, Any]) -> dict[str, Any]:
+    """What repeated trainings have in common of the labels that they learned from: all but the contents.
+
+    Where it is not told how many months of each round there are, as of early trainings, contents tell labels apart.
+    """
+    return {name: value for name, value in identity.items() if name != "labels" or "months" not in identity}
 
 
 def read_labels_description(folder: Path) -> dict[str, Any]:

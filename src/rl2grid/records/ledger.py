@@ -16,6 +16,7 @@ from typing import Any
 
 from rl2grid.records.evaluations import Evaluation, identity_hash
 from rl2grid.records.files import CHECKSUM, checksum, misfit, not_what, read_json, write_json
+from rl2grid.records.labels import chosen_of_labels
 from rl2grid.records.locks import locked
 from rl2grid.records.month_values import pack_months
 
@@ -30,6 +31,8 @@ _TEST = {
 }
 STARTED_FROM = "started_from"
 """In a configuration: algorithm, decisions and hash of the policy that a training began with."""
+LABELS = "labels"
+"""In a configuration: teacher, rounds, months of each round and hashes of the labels that it learned from."""
 _FIGURES = ("survival", "completed", "cost_lsi", "cost_tlo", "safe_lsi", "safe_tlo", "decisions")
 
 
@@ -115,12 +118,15 @@ def agent_of(configuration: Mapping[str, Any]) -> str:
 def choice_hash(configuration: Mapping[str, Any]) -> str:
     """Hash of what was chosen: a configuration without its seed, which repeats a training and chooses nothing.
 
-    So does a policy that it began with, if that is of another seed of the same algorithm.
+    So do a policy that it began with, if that is of another seed of the same algorithm, and labels of as many other
+    months by the same teacher.
     """
     chosen = dict(configuration)
     chosen["hyperparameters"] = _without(configuration.get("hyperparameters", {}), "seed")
     if STARTED_FROM in configuration:
         chosen[STARTED_FROM] = _without(configuration[STARTED_FROM], "policy_hash")
+    if LABELS in configuration:
+        chosen[LABELS] = chosen_of_labels(configuration[LABELS])
     return identity_hash(chosen)
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from rl2grid.arrays import F64
 from rl2grid.errors import UsageError
 from rl2grid.records.files import make_folder, read_json, set_aside, write_record
+from rl2grid.records.labels import chosen_of_labels
 from rl2grid.records.metrics import EPISODES, METRICS_FILE, SURVIVAL, VALIDATION, read_rows
 
 RUN_FILE, ENERGY_FILE, TRACKING_FILE = "config.json", "energy.json", "wandb.json"
@@ -197,10 +198,12 @@ def read_training_run(folder: Path, label: str | None = None) -> TrainingRun:
     hyperparameters = dict(request["hyperparameters"])
     seed = int(hyperparameters.pop("seed"))
     task, algorithm, keywords = request["task"], request["algorithm"], request["env_keywords"]
-    # Runs of one method may each begin with a policy of their own.
-    hyperparameters.pop("start_from", None)
+    # Runs of one method may each begin with a policy of their own, and learn from labels of their own months.
+    for place in ("start_from", "labels"):
+        hyperparameters.pop(place, None)
     settings = {
-        **{key: value for key, value in identity.items() if key not in ("seed", "start")},
+        **{key: value for key, value in identity.items() if key not in ("seed", "start", "labels")},
+        "labels": chosen_of_labels(identity.get("labels", {})),
         "started from": identity.get("start", {}).get("algorithm"),
         **keywords,
         **hyperparameters,
