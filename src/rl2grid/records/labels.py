@@ -281,14 +281,6 @@ def read_labels(folders: Sequence[Path], task_id: str) -> tuple[LabelsDescriptio
     ), labels
 
 
-def chosen_of_labels(identity: Mapping[str, Any]) -> dict[str, Any]:
-    """What repeated trainings have in common of the labels that they learned from: all but the contents.
-
-    Where it is not told how many months of each round there are, as of early trainings, contents tell labels apart.
-    """
-    return {name: value for name, value in identity.items() if name != "labels" or "months" not in identity}
-
-
 def read_labels_description(folder: Path) -> dict[str, Any]:
     """What :data:`LABELS_FILE` of a folder says.
 

@@ -16,9 +16,9 @@ from typing import Any
 
 from rl2grid.records.evaluations import Evaluation, identity_hash
 from rl2grid.records.files import CHECKSUM, checksum, misfit, not_what, read_json, write_json
-from rl2grid.records.labels import chosen_of_labels
 from rl2grid.records.locks import locked
 from rl2grid.records.month_values import pack_months
+from rl2grid.records.trainings import chosen_of_labels
 
 _REMEDY = "give a file that 'rl2grid leaderboard test' wrote, or one that does not exist yet"
 _TEST = {

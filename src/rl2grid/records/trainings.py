@@ -14,7 +14,6 @@ import numpy as np
 from rl2grid.arrays import F64
 from rl2grid.errors import UsageError
 from rl2grid.records.files import make_folder, read_json, set_aside, write_record
-from rl2grid.records.labels import chosen_of_labels
 from rl2grid.records.metrics import EPISODES, METRICS_FILE, SURVIVAL, VALIDATION, read_rows
 
 RUN_FILE, ENERGY_FILE, TRACKING_FILE = "config.json", "energy.json", "wandb.json"
@@ -179,6 +178,14 @@ def read_training_curve(path: Path, label: str, *, of_play: bool = True) -> Trai
     if SURVIVAL not in metrics and (of_play or VALIDATION not in metrics):
         raise UsageError(f"{path} has no survival yet: no episode has ended in training.")
     return TrainingCurve(label, metrics)
+
+
+def chosen_of_labels(identity: Mapping[str, Any]) -> dict[str, Any]:
+    """What repeated trainings have in common of the labels that they learned from: all but the contents.
+
+    Where it is not told how many months of each round there are, as of early trainings, contents tell labels apart.
+    """
+    return {name: value for name, value in identity.items() if name != "labels" or "months" not in identity}
 
 
 def read_training_run(folder: Path, label: str | None = None) -> TrainingRun:
