@@ -1,7 +1,7 @@
 """Results on the pages, made from the ledger while the site is built: a figure and a short table of each task.
 
 Pages name the tasks, with ``<!-- results: bus14-T0 -->``, or with ``<!-- figure: bus14-T0 -->`` for the figure alone;
-``<!-- overview -->`` is the table of all tasks.
+``<!-- overview -->`` is the table of all tasks, ``<!-- learned -->`` that of methods trained with several seeds.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from mkdocs.structure.pages import Page
 from pictures import add_picture, picture_markdown
 
 from rl2grid.analysis.ledger_figure import draw_ledger
+from rl2grid.analysis.ledger_learned import learned_table
 from rl2grid.analysis.ledger_overview import overview_table
 from rl2grid.analysis.ledger_table import short_ledger_table
 from rl2grid.envs.tasks import find_task
@@ -24,7 +25,7 @@ from rl2grid.records.ledger import HashedTest, read_ledger
 
 LEDGER = Path(__file__).resolve().parents[2] / "benchmarks" / "results" / "baselines.json"
 PAGES = ("results.md", "index.md")
-_OVERVIEW = "<!-- overview -->"
+_TABLES = {"<!-- overview -->": overview_table, "<!-- learned -->": learned_table}
 _MARK = re.compile(r"<!-- (results|figure): (\S+) -->")
 
 
@@ -43,7 +44,10 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
         return markdown
     results = read_ledger(LEDGER)
     shown = _MARK.sub(partial(_shown, results), markdown)
-    return shown.replace(_OVERVIEW, overview_table(results)) if _OVERVIEW in shown else shown
+    for mark, table in _TABLES.items():
+        if mark in shown:
+            shown = shown.replace(mark, table(results))
+    return shown
 
 
 def _shown(results: Mapping[str, HashedTest], mark: re.Match[str]) -> str:

@@ -23,19 +23,25 @@ def overview_table(results: Mapping[str, HashedTest]) -> str:
     Args:
         results: of a ledger.
     """
-    by_task: dict[str, list[LedgerRow]] = {}
-    for row in ledger_rows(by_present_rules(results), results):
-        by_task.setdefault(row.first.task, []).append(row)
-    order = {task: place for place, task in enumerate(all_tasks())}
     lines = [markdown_row(["task", *KINDS]), "|:--|" + ":--|" * len(KINDS)]
-    for task in sorted(by_task, key=lambda one: order.get(one, len(order))):
-        best = [_best([row for row in by_task[task] if _kind(row.first) == kind]) for kind in KINDS]
+    for task, rows in by_task(results).items():
+        best = [best_row([row for row in rows if kind_of(row.first) == kind]) for kind in KINDS]
         highest = max(_survival(row) for row in best if row is not None)
         lines.append(markdown_row([short_id(task), *(_cell(row, highest) for row in best)]))
     return "\n".join(lines)
 
 
-def _kind(result: HashedTest) -> str:
+def by_task(results: Mapping[str, HashedTest]) -> dict[str, list[LedgerRow]]:
+    """The rows by present rules of every task, tasks in the order of their registration."""
+    found: dict[str, list[LedgerRow]] = {}
+    for row in ledger_rows(by_present_rules(results), results):
+        found.setdefault(row.first.task, []).append(row)
+    order = {task: place for place, task in enumerate(all_tasks())}
+    return {task: found[task] for task in sorted(found, key=lambda one: order.get(one, len(order)))}
+
+
+def kind_of(result: HashedTest) -> str:
+    """Which of :data:`KINDS` played."""
     if result.has_learned:
         return "learned"
     if result.agent == "planner":
@@ -43,7 +49,8 @@ def _kind(result: HashedTest) -> str:
     return "do nothing" if result.label == "do-nothing" else "search and rules"
 
 
-def _best(rows: Sequence[LedgerRow]) -> LedgerRow | None:
+def best_row(rows: Sequence[LedgerRow]) -> LedgerRow | None:
+    """The row of the highest mean survival; None: there is no row."""
     return max(rows, key=_survival, default=None)
 
 

@@ -15,7 +15,7 @@ from rl2grid.envs.tasks import find_task
 from rl2grid.errors import UsageError
 from rl2grid.records.entries import PlayableEntry, read_entry, write_entry
 from rl2grid.records.evaluations import check_comparable
-from rl2grid.records.ledger import add_test, read_ledger
+from rl2grid.records.ledger import HashedTest, add_test, read_ledger
 from rl2grid.records.methods import Method
 from rl2grid.scenarios.splits import SPLITS
 
@@ -79,6 +79,9 @@ def _add_table(actions: Any) -> None:
     )
     parser.add_argument(
         "--best", action="store_true", help="of a ledger: the best of each kind of agent, a row per task"
+    )
+    parser.add_argument(
+        "--learned", action="store_true", help="of a ledger: methods trained with several seeds, a row per task"
     )
     add_scores_flag(parser)
     parser.set_defaults(run=_table)
@@ -168,13 +171,18 @@ def _verified(found: Mapping[str, str | None], output: Output) -> int:
 
 def _check_what_is_ranked(options: argparse.Namespace) -> None:
     """Refuse files beside a ledger, and flags of the one for the other: they would be passed over in silence."""
+    shown = {"--task": options.only, "--to": options.to}
+    of_all_tasks = {"--best": options.best or None, "--learned": options.learned or None}
     if options.ledger is None:
-        for flag, value in (("--task", options.only), ("--to", options.to), ("--best", options.best or None)):
+        for flag, value in {**shown, **of_all_tasks}.items():
             if value is not None:
                 raise UsageError(f"{flag} is for the rows of a --ledger: leave it out for entries.")
         return
-    if options.best and not (options.only is None and options.to is None):
-        raise UsageError("--best shows all tasks and compares nothing: leave out --task and --to.")
+    asked = [flag for flag, value in of_all_tasks.items() if value is not None]
+    if asked and any(value is not None for value in shown.values()):
+        raise UsageError(f"{asked[0]} shows all tasks and compares nothing: leave out --task and --to.")
+    if len(asked) > 1:
+        raise UsageError("--best and --learned are two tables: ask for one of them.")
     if options.files:
         raise UsageError("Entries and a --ledger do not belong into one table: name the one or the other.")
     if options.l2rpn:
@@ -183,15 +191,23 @@ def _check_what_is_ranked(options: argparse.Namespace) -> None:
         raise UsageError(f"There is no ledger {options.ledger}: give a file that 'rl2grid leaderboard test' wrote.")
 
 
+def _ledger_text(options: argparse.Namespace, tests: Mapping[str, HashedTest]) -> str:
+    from rl2grid.analysis.ledger_learned import learned_table
+    from rl2grid.analysis.ledger_overview import overview_table
+    from rl2grid.analysis.ledger_table import ledger_table
+
+    if options.best:
+        return overview_table(tests)
+    if options.learned:
+        return learned_table(tests)
+    return ledger_table(tests, None if options.only is None else find_task(options.only).id, options.to)
+
+
 def _table(options: argparse.Namespace, output: Output) -> int:
     _check_what_is_ranked(options)
     if options.ledger is not None:
-        from rl2grid.analysis.ledger_overview import overview_table
-        from rl2grid.analysis.ledger_table import ledger_table
-
-        task = None if options.only is None else find_task(options.only).id
         tests = read_ledger(options.ledger)
-        output.text(overview_table(tests) if options.best else ledger_table(tests, task, options.to))
+        output.text(_ledger_text(options, tests))
         output.results(tests=[asdict(test) for test in tests.values()])
         return 0
     from rl2grid.analysis.result_tables import entry_table
