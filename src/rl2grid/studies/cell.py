@@ -95,7 +95,9 @@ def _teach_command(cell: Cell, training: Training, folder: Path, number: int) ->
         return []
     words = ["rl2grid", "teach", training.lessons.teacher, short_id(cell.task.id)]
     words += ["--months", str(training.rounds[number]), "--seed", str(training.seed)]
-    words += ["--pupil", str(folder / f"pupil-{number}")] if number else []
+    pupil = _pupil(training, folder, number)
+    words += [] if pupil is None else ["--pupil", str(pupil)]
+    words += ["--gamma", f"{training.resolved(cell.task).gamma:g}"]
     words += environment_flags({"heuristic": cell.heuristic, **cell.environment})
     return [shlex.join([*words, "--output", str(folder / LABELS_FOLDER)])]
 
@@ -159,12 +161,17 @@ def _teach(cell: Cell, training: Training, folder: Path, number: int) -> None:
         output=folder / LABELS_FOLDER,
         seed=training.seed,
         heuristic=cell.heuristic,
-        pupil=training_folders(folder, len(training.rounds))[number - 1] if number else None,
+        pupil=_pupil(training, folder, number),
         gamma=training.resolved(cell.task).gamma,
         workers=0,
         command=_teach_command(cell, training, folder, number)[0],
         **cell.environment,
     )
+
+
+def _pupil(training: Training, folder: Path, number: int) -> Path | None:
+    """Who plays the months of a round; None: the teacher."""
+    return training_folders(folder, len(training.rounds))[number - 1] if number else None
 
 
 def _train(cell: Cell, training: Training, run: Path) -> None:
