@@ -29,10 +29,10 @@ from rl2grid.evaluation.agents import AGENTS, make_agent
 from rl2grid.evaluation.protocol import AS_TRAINED, evaluate, first_months
 from rl2grid.records.files import write_json
 from rl2grid.records.versions import processor
+from rl2grid.scenarios.episodes import MAX_STEPS
 from rl2grid.scenarios.splits import VALIDATION
 
 RESULTS = Path(__file__).resolve().parent / "results" / "decision_time.json"
-STEPS_OF_A_MONTH = 8064
 
 
 def row_of(agent: Agent, task: Task, heuristic: str | None, months: tuple[str, ...]) -> dict[str, Any]:
@@ -40,7 +40,7 @@ def row_of(agent: Agent, task: Task, heuristic: str | None, months: tuple[str, .
     timed = Timed(agent)
     played = evaluate(timed, task, scenarios=months, heuristic=heuristic, workers=0, progress=True)
     milliseconds = 1e3 * np.array(timed.seconds)
-    per_month = STEPS_OF_A_MONTH / sum(episode.grid_steps for episode in played.episodes)
+    per_month = MAX_STEPS / sum(episode.grid_steps for episode in played.episodes)
     return {
         "survival": round(played.summary.survival.value, 4),
         "decisions_a_month": round(len(milliseconds) * per_month, 1),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
-from rl2grid.analysis.ledger_overview import best_row, by_task, kind_of
+from rl2grid.analysis.ledger_overview import KINDS, best_row, by_task, kind_of
 from rl2grid.analysis.ledger_table import LedgerRow
 from rl2grid.analysis.table import markdown_row, with_interval
 from rl2grid.envs.tasks import short_id
@@ -15,7 +15,7 @@ from rl2grid.records.statistics import aggregated, estimate
 
 SEVERAL = 2
 """Trainings that a method needs to have a cell."""
-BESIDE = ("do nothing", "search and rules", "planner")
+BESIDE = KINDS[:-1]
 """What learned nothing, the best of each kind."""
 
 

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import shlex
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from rl2grid.cli import keywords
 from rl2grid.cli.output import Output
-from rl2grid.envs.tasks import Task, find_task, short_id
-from rl2grid.evaluation.flags import environment_flags
+from rl2grid.envs.tasks import find_task, short_id
+from rl2grid.training.commands import teach_command
 from rl2grid.training.teaching import MONTHS, PUPIL_SHARE, THIN, summary_of, teach
 
 
@@ -67,7 +64,18 @@ def _run(options: argparse.Namespace, output: Output) -> int:
         thin=options.thin,
         workers=options.workers,
         progress=output.talks,
-        command=_command(options, task, chosen),
+        command=teach_command(
+            options.agent,
+            task,
+            chosen,
+            months=options.months,
+            seed=options.seed,
+            pupil=options.pupil,
+            pupil_share=options.pupil_share,
+            gamma=options.gamma,
+            thin=options.thin,
+            output=options.output,
+        ),
         **chosen,
     )
     summary = summary_of(taught)
@@ -79,17 +87,3 @@ def _run(options: argparse.Namespace, output: Output) -> int:
         f"{f' with {taught.pupil} acting' if taught.pupil else ''}."
     )
     return 0
-
-
-def _command(options: argparse.Namespace, task: Task, chosen: Mapping[str, Any]) -> str:
-    """What to type to go on, whatever is the default then."""
-    words = ["rl2grid", "teach", options.agent, short_id(task.id), "--months", str(options.months)]
-    words += ["--seed", str(options.seed)] if options.seed else []
-    if options.pupil is not None:
-        words += ["--pupil", options.pupil, "--pupil-share", f"{options.pupil_share:g}"]
-    words += [] if options.gamma is None else ["--gamma", f"{options.gamma:g}"]
-    words += ["--thin", f"{options.thin:g}"]
-    words += ["--heuristic", str(chosen["heuristic"])] if "heuristic" in chosen else []
-    words += environment_flags({**chosen, "heuristic": None})
-    words += [] if options.output is None else ["--output", str(options.output)]
-    return shlex.join(words)

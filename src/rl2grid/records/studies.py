@@ -70,11 +70,6 @@ def write_cell(folder: Path, cell: Mapping[str, Any]) -> None:
     write_record(folder / CELL_FILE, dict(cell))
 
 
-def training_folders(folder: Path, n_rounds: int) -> list[Path]:
-    """The run folders of a cell, in order: a pupil for each round of labels but the last, then the run."""
-    return [*(folder / f"pupil-{number}" for number in range(1, n_rounds)), folder / RUN_FOLDER]
-
-
 def is_cell_finished(folder: Path) -> bool:
     """Whether a cell has its result."""
     return (folder / RESULT_FILE).is_file()

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import json
 import os
-import shlex
 import signal
 import subprocess
 import sys
@@ -28,9 +27,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from rl2grid.envs.tasks import short_id
 from rl2grid.errors import UsageError
-from rl2grid.evaluation.flags import environment_flags, evaluate_command
+from rl2grid.evaluation.flags import evaluate_command
 from rl2grid.evaluation.protocol import evaluate
 from rl2grid.records.locks import LockedError, locked
 from rl2grid.records.logs import last_line, open_log
@@ -42,15 +40,14 @@ from rl2grid.records.studies import (
     CellResult,
     read_cell,
     read_result,
-    training_folders,
     write_cell,
     write_result,
 )
 from rl2grid.scenarios.splits import VALIDATION_MONTHS
-from rl2grid.studies.cells import Cell, Training, cell_from_dict, cell_to_dict
+from rl2grid.studies.cells import Cell, Lessons, Training, cell_from_dict, cell_to_dict
 from rl2grid.training import request, runs
-from rl2grid.training.commands import train_command
-from rl2grid.training.teaching import teach
+from rl2grid.training.commands import teach_command, train_command
+from rl2grid.training.teaching import PUPIL_SHARE, THIN, teach
 from rl2grid.training.validation import validator
 
 FINISHED, FAILED, REFUSED, BUSY, STOPPED = 0, 1, 2, 75, 130
@@ -82,24 +79,28 @@ def commands(folder: Path, cell: Cell) -> list[str]:
     """What to type to obtain the cell by hand."""
     keywords, lines, agent = {"heuristic": cell.heuristic, **cell.environment}, [], cell.agent
     if cell.training is not None:
-        trainings = training_folders(folder, len(cell.training.rounds))
+        trainings = cell.training.folders(folder)
         for number, run in enumerate(trainings):
-            lines += _teach_command(cell, cell.training, folder, number)
+            if cell.training.lessons is not None:
+                lines.append(_teach_command(cell, cell.training, cell.training.lessons, folder, number))
             lines.append(train_command(_run_args(cell, cell.training, run), cell.training.preset, run))
         agent = str(trainings[-1])
     return [*lines, evaluate_command(agent, cell.task, cell.split, cell.evaluation_seeds, cell.months, keywords)]
 
 
-def _teach_command(cell: Cell, training: Training, folder: Path, number: int) -> list[str]:
-    if training.lessons is None:
-        return []
-    words = ["rl2grid", "teach", training.lessons.teacher, short_id(cell.task.id)]
-    words += ["--months", str(training.rounds[number]), "--seed", str(training.seed)]
-    pupil = _pupil(training, folder, number)
-    words += [] if pupil is None else ["--pupil", str(pupil)]
-    words += ["--gamma", f"{training.resolved(cell.task).gamma:g}"]
-    words += environment_flags({"heuristic": cell.heuristic, **cell.environment})
-    return [shlex.join([*words, "--output", str(folder / LABELS_FOLDER)])]
+def _teach_command(cell: Cell, training: Training, lessons: Lessons, folder: Path, number: int) -> str:
+    return teach_command(
+        lessons.teacher,
+        cell.task,
+        {"heuristic": cell.heuristic, **cell.environment},
+        months=lessons.rounds[number],
+        seed=training.seed,
+        pupil=_pupil(training, folder, number),
+        pupil_share=PUPIL_SHARE,
+        gamma=training.resolved(cell.task).gamma,
+        thin=THIN,
+        output=folder / LABELS_FOLDER,
+    )
 
 
 def run_cell(folder: Path) -> None:
@@ -123,9 +124,10 @@ def _finish(folder: Path) -> None:
     agent: str | Path = cell.agent
     trainings: list[Path] = []
     if cell.training is not None:
-        trainings = training_folders(folder, len(cell.training.rounds))
+        trainings = cell.training.folders(folder)
         for number, run in enumerate(trainings):
-            _teach(cell, cell.training, folder, number)
+            if cell.training.lessons is not None:
+                _teach(cell, cell.training, cell.training.lessons, folder, number)
             _train(cell, cell.training, run)
         agent = trainings[-1]
     result = evaluate(
@@ -150,28 +152,26 @@ def _finish(folder: Path) -> None:
     write_result(folder, summary)
 
 
-def _teach(cell: Cell, training: Training, folder: Path, number: int) -> None:
+def _teach(cell: Cell, training: Training, lessons: Lessons, folder: Path, number: int) -> None:
     """Label a round, or what is missing of it."""
-    if training.lessons is None:
-        return
     teach(
-        training.lessons.teacher,
+        lessons.teacher,
         cell.task,
-        months=training.rounds[number],
+        months=lessons.rounds[number],
         output=folder / LABELS_FOLDER,
         seed=training.seed,
         heuristic=cell.heuristic,
         pupil=_pupil(training, folder, number),
         gamma=training.resolved(cell.task).gamma,
         workers=0,
-        command=_teach_command(cell, training, folder, number)[0],
+        command=_teach_command(cell, training, lessons, folder, number),
         **cell.environment,
     )
 
 
 def _pupil(training: Training, folder: Path, number: int) -> Path | None:
     """Who plays the months of a round; None: the teacher."""
-    return training_folders(folder, len(training.rounds))[number - 1] if number else None
+    return training.folders(folder)[number - 1] if number else None
 
 
 def _train(cell: Cell, training: Training, run: Path) -> None:

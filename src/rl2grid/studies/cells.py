@@ -11,7 +11,7 @@ from rl2grid.algorithms.registry import Hyperparameters
 from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.protocol import first_months
-from rl2grid.records.studies import CELLS_FOLDER
+from rl2grid.records.studies import CELLS_FOLDER, RUN_FOLDER
 from rl2grid.studies.toml_file import with_tuples
 from rl2grid.training import request
 
@@ -43,6 +43,10 @@ class Training:
     def rounds(self) -> tuple[int, ...]:
         """Months of each round of labels; empty where nothing is labelled."""
         return self.lessons.rounds if self.lessons else ()
+
+    def folders(self, cell: Path) -> list[Path]:
+        """The run folders in that of a cell, in order: a pupil for each round of labels but the last, then the run."""
+        return [*(cell / f"pupil-{number}" for number in range(1, len(self.rounds))), cell / RUN_FOLDER]
 
     def resolved(self, task: Task) -> Hyperparameters:
         """All hyperparameters, but for the folder of labels that the cell makes.

@@ -16,7 +16,6 @@ from rl2grid.records.studies import (
     played_episodes,
     read_result,
     read_study,
-    training_folders,
 )
 from rl2grid.studies.cells import Cell, Study
 
@@ -66,7 +65,7 @@ class CellState:
 
     @property
     def _trainings(self) -> list[Path]:
-        return training_folders(self.folder, self.rounds)
+        return self.cell.training.folders(self.folder) if self.cell.training else []
 
     @property
     def pupils(self) -> int:

@@ -216,9 +216,7 @@ class _Group:
         if teacher not in AGENTS:
             raise unknown(f"{upper(self.where)}: teacher", teacher, list(AGENTS))
         self._check_agent(teacher, task)
-        if not isinstance(rounds, list) or not rounds:
-            raise UsageError(f"{upper(self.where)}: rounds must be a list such as [200, 200], not {rounds!r}.")
-        return Lessons(teacher, tuple(count(self.where, "each of rounds", months, 1) for months in rounds))
+        return Lessons(teacher, tuple(self._counts("rounds", rounds, 1, "[200, 200]")))
 
     def _changes(self, algorithm: str) -> dict[str, Any]:
         """Hyperparameters of the group: those of all its algorithms, then those of this one."""
@@ -268,10 +266,13 @@ class _Group:
         return keywords
 
     def _seeds(self) -> list[int]:
-        seeds = self._setting("seeds", [1])
-        if not isinstance(seeds, list) or not seeds:
-            raise UsageError(f"{upper(self.where)}: seeds must be a list such as [1, 2, 3], not {seeds!r}.")
-        return [count(self.where, "each of seeds", seed, 0) for seed in seeds]
+        return self._counts("seeds", self._setting("seeds", [1]), 0, "[1, 2, 3]")
+
+    def _counts(self, key: str, values: Any, at_least: int, example: str) -> list[int]:
+        """The values, if they are a list of whole numbers that are large enough."""
+        if not isinstance(values, list) or not values:
+            raise UsageError(f"{upper(self.where)}: {key} must be a list such as {example}, not {values!r}.")
+        return [count(self.where, f"each of {key}", value, at_least) for value in values]
 
     def _setting(self, key: str, default: Any) -> Any:
         """The group's value, else the scale's, else the study's; the group may give one per scale."""

@@ -1,12 +1,14 @@
-"""What to type to make a training run again."""
+"""What to type to make a training run, or labels, again."""
 
 from __future__ import annotations
 
 import shlex
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
-from rl2grid.envs.tasks import short_id
+from rl2grid.envs.tasks import Task, short_id
 from rl2grid.evaluation.flags import environment_flags, flags
 from rl2grid.training import request
 
@@ -45,3 +47,41 @@ def training_command(folder: Path) -> str:
     """
     args, _ = request.read_config(folder)
     return train_command(args, folder=folder)
+
+
+def teach_command(
+    teacher: str,
+    task: Task,
+    keywords: Mapping[str, Any],
+    *,
+    months: int,
+    seed: int,
+    pupil: str | Path | None,
+    pupil_share: float,
+    gamma: float | None,
+    thin: float,
+    output: Path | None,
+) -> str:
+    """The ``rl2grid teach`` that labels a round, or goes on with it, whatever is the default then.
+
+    Args:
+        teacher: who labels.
+        task: whose months.
+        keywords: of the environments that were given; a heuristic of None is told as well.
+        months: of the round.
+        seed: of the labels.
+        pupil: who plays; None: the teacher.
+        pupil_share: how often.
+        gamma: the discount; None: the usual one.
+        thin: one is kept of so many safe states in which nothing is done.
+        output: the folder; None: the usual one.
+    """
+    words = ["rl2grid", "teach", teacher, short_id(task.id), "--months", str(months)]
+    words += ["--seed", str(seed)] if seed else []
+    words += [] if pupil is None else ["--pupil", str(pupil), "--pupil-share", f"{pupil_share:g}"]
+    words += [] if gamma is None else ["--gamma", f"{gamma:g}"]
+    words += ["--thin", f"{thin:g}"]
+    words += ["--heuristic", str(keywords["heuristic"])] if "heuristic" in keywords else []
+    words += environment_flags({**keywords, "heuristic": None})
+    words += [] if output is None else ["--output", str(output)]
+    return shlex.join(words)
