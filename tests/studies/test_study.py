@@ -39,6 +39,7 @@ GROUP: dict[str, Any] = {"algorithms": ["ppo"], "tasks": ["bus14-T0"]}
 
 
 PUPIL = {"algorithms": ["imitation"], "teacher": "greedy", "rounds": [2, 2]}
+TAUGHT = {**PUPIL, "algorithms": ["ppo"]}
 
 
 def contents(**changes: Any) -> dict[str, Any]:
@@ -118,6 +119,10 @@ def test_hyperparameters_are_those_of_all_then_those_of_one_algorithm():
         ({"group": {**PUPIL, "rounds": 20}}, "rounds must be a list such as [200, 200], not 20"),
         ({"group": {**PUPIL, "rounds": [20, 0]}}, "each of rounds must be a whole number of at least 1, not 0"),
         ({"group": {**PUPIL, "hyperparameters": {"labels": ["some"]}}}, "has labels and a teacher"),
+        ({"group": {**PUPIL, "algorithms": ["dqn"]}}, "trains dqn, which cannot go on from a pupil"),
+        ({"group": {**TAUGHT, "hyperparameters": {"start_from": "some"}}}, "has start_from and a teacher"),
+        ({"group": {**TAUGHT, "pupil_budget": 0}}, "pupil_budget must be a whole number of at least 1, not 0"),
+        ({"group": {**TAUGHT, "pupil_budget": 7}}, "Imitation needs total_timesteps (--decisions) of at least"),
     ],
 )
 def test_a_bad_file_is_refused_in_one_sentence(changes: dict[str, Any], part: str):
@@ -213,6 +218,29 @@ def test_a_pupil_is_labelled_for_in_rounds_and_goes_on_after_an_interruption(tmp
     assert whole.survival == stopped.survival
     words = commands(tmp_path / "whole", cell)
     assert [line.split()[1] for line in words] == ["teach", "train", "teach", "train", "evaluate"]
+
+
+def test_an_algorithm_goes_on_from_the_last_pupil(tmp_path: Path):
+    group = {
+        **TAUGHT,
+        "pupil_budget": 20_000,
+        "environment": {"episode_length": 288},
+        "hyperparameters": {"actor_layers": [8], "gamma": 0.95},
+    }
+    (cell,) = parse_study(contents(group=group, budget=512, split="validation", validations=1)).cells
+    assert cell.name == "bus14-T0-v0-ppo-from-imitation-1"
+    assert cell_from_dict(json.loads(json.dumps(cell_to_dict(cell)))) == cell
+    prepare(tmp_path, cell)
+    run_cell(tmp_path)
+    words = [line.split()[1:3] for line in commands(tmp_path, cell)]
+    assert words == [
+        *(["teach", "greedy"], ["train", "imitation"]) * 2,
+        ["train", "ppo"],
+        ["evaluate", str(tmp_path / "run")],
+    ]
+    began = json.loads((tmp_path / "run" / "config.json").read_text())["identity"]["start"]
+    assert began["algorithm"] == "imitation"
+    assert began["path"] == str(tmp_path / "pupil-2")
 
 
 class FakeBackend:

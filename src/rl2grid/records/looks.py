@@ -54,7 +54,10 @@ def is_outdated(result: HashedTest, results: Mapping[str, HashedTest]) -> bool:
 
 def by_present_rules(results: Mapping[str, HashedTest]) -> dict[str, HashedTest]:
     """Without what is outdated."""
-    return {digest: one for digest, one in results.items() if not is_outdated(one, results)}
+    latest: dict[tuple[Any, ...], int] = {}
+    for one in results.values():
+        latest[_played_by(one)] = max(one.rules, latest.get(_played_by(one), one.rules))
+    return {digest: one for digest, one in results.items() if one.rules == latest[_played_by(one)]}
 
 
 def method_of(result: HashedTest) -> tuple[Any, ...]:

@@ -4,7 +4,7 @@ A cell's folder holds
 
 - ``cell.json``: what is asked for;
 - ``labels/`` and ``pupil-1/``, ``pupil-2/``, ...: what a teacher labelled, see :mod:`rl2grid.training.teaching`, and
-  the pupils of all rounds but the last, on whose states the next round is labelled;
+  the pupils on whose states the next round is labelled, or from the last of which the run goes on;
 - ``run/``: the training run, if the agent learns, see :mod:`rl2grid.training.runs`;
 - ``evaluation/``: the episodes, see :mod:`rl2grid.evaluation.protocol`;
 - ``log.txt``: what its processes printed, see :mod:`rl2grid.records.logs`;
@@ -24,7 +24,6 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from rl2grid.errors import UsageError
@@ -44,7 +43,7 @@ from rl2grid.records.studies import (
     write_result,
 )
 from rl2grid.scenarios.splits import VALIDATION_MONTHS
-from rl2grid.studies.cells import Cell, Lessons, Training, cell_from_dict, cell_to_dict
+from rl2grid.studies.cells import Cell, Step, cell_from_dict, cell_to_dict
 from rl2grid.training import request, runs
 from rl2grid.training.commands import teach_command, train_command
 from rl2grid.training.teaching import PUPIL_SHARE, THIN, teach
@@ -78,28 +77,32 @@ def prepare(folder: Path, cell: Cell) -> None:
 def commands(folder: Path, cell: Cell) -> list[str]:
     """What to type to obtain the cell by hand."""
     keywords, lines, agent = {"heuristic": cell.heuristic, **cell.environment}, [], cell.agent
-    if cell.training is not None:
-        trainings = cell.training.folders(folder)
-        for number, run in enumerate(trainings):
-            if cell.training.lessons is not None:
-                lines.append(_teach_command(cell, cell.training, cell.training.lessons, folder, number))
-            lines.append(train_command(_run_args(cell, cell.training, run), cell.training.preset, run))
-        agent = str(trainings[-1])
+    for step in _steps(folder, cell):
+        if step.labelled_months:
+            lines.append(_teach_command(cell, step))
+        lines.append(train_command(_run_args(cell, step), step.preset, step.folder))
+        agent = str(step.folder)
     return [*lines, evaluate_command(agent, cell.task, cell.split, cell.evaluation_seeds, cell.months, keywords)]
 
 
-def _teach_command(cell: Cell, training: Training, lessons: Lessons, folder: Path, number: int) -> str:
+def _steps(folder: Path, cell: Cell) -> list[Step]:
+    return [] if cell.training is None else cell.training.steps(cell.task, folder)
+
+
+def _teach_command(cell: Cell, step: Step) -> str:
+    assert cell.training is not None
+    assert cell.training.lessons is not None
     return teach_command(
-        lessons.teacher,
+        cell.training.lessons.teacher,
         cell.task,
         {"heuristic": cell.heuristic, **cell.environment},
-        months=lessons.rounds[number],
-        seed=training.seed,
-        pupil=_pupil(training, folder, number),
+        months=step.labelled_months,
+        seed=cell.training.seed,
+        pupil=step.labelled_with,
         pupil_share=PUPIL_SHARE,
-        gamma=training.resolved(cell.task).gamma,
+        gamma=step.hyperparameters.gamma,
         thin=THIN,
-        output=folder / LABELS_FOLDER,
+        output=step.folder.parent / LABELS_FOLDER,
     )
 
 
@@ -122,14 +125,12 @@ def _finish(folder: Path) -> None:
         raise UsageError(f"{folder} holds no cell: there is no {CELL_FILE} in it.")
     cell = cell_from_dict(stored)
     agent: str | Path = cell.agent
-    trainings: list[Path] = []
-    if cell.training is not None:
-        trainings = cell.training.folders(folder)
-        for number, run in enumerate(trainings):
-            if cell.training.lessons is not None:
-                _teach(cell, cell.training, cell.training.lessons, folder, number)
-            _train(cell, cell.training, run)
-        agent = trainings[-1]
+    steps = _steps(folder, cell)
+    for step in steps:
+        if step.labelled_months:
+            _teach(cell, step)
+        _train(cell, step)
+        agent = step.folder
     result = evaluate(
         agent,
         cell.task,
@@ -142,7 +143,9 @@ def _finish(folder: Path) -> None:
         command=commands(folder, cell)[-1],
         **cell.environment,
     )
-    seconds = sum(map(trained_seconds, trainings)) + sum(episode.wall_time_s for episode in result.episodes)
+    seconds = sum(trained_seconds(step.folder) for step in steps) + sum(
+        episode.wall_time_s for episode in result.episodes
+    )
     summary = CellResult(
         minutes=round(seconds / 60.0, 2),
         identity=result.episodes[0].identity,
@@ -152,36 +155,34 @@ def _finish(folder: Path) -> None:
     write_result(folder, summary)
 
 
-def _teach(cell: Cell, training: Training, lessons: Lessons, folder: Path, number: int) -> None:
+def _teach(cell: Cell, step: Step) -> None:
     """Label a round, or what is missing of it."""
+    assert cell.training is not None
+    assert cell.training.lessons is not None
     teach(
-        lessons.teacher,
+        cell.training.lessons.teacher,
         cell.task,
-        months=lessons.rounds[number],
-        output=folder / LABELS_FOLDER,
-        seed=training.seed,
+        months=step.labelled_months,
+        output=step.folder.parent / LABELS_FOLDER,
+        seed=cell.training.seed,
         heuristic=cell.heuristic,
-        pupil=_pupil(training, folder, number),
-        gamma=training.resolved(cell.task).gamma,
+        pupil=step.labelled_with,
+        gamma=step.hyperparameters.gamma,
         workers=0,
-        command=_teach_command(cell, training, lessons, folder, number),
+        command=_teach_command(cell, step),
         **cell.environment,
     )
 
 
-def _pupil(training: Training, folder: Path, number: int) -> Path | None:
-    """Who plays the months of a round; None: the teacher."""
-    return training.folders(folder)[number - 1] if number else None
-
-
-def _train(cell: Cell, training: Training, run: Path) -> None:
+def _train(cell: Cell, step: Step) -> None:
     """Train, or go on.
 
     Raises:
         KeyboardInterrupt: it was asked to stop before the end.
     """
+    run = step.folder
     if not run.exists():
-        args = _run_args(cell, training, run)
+        args = _run_args(cell, step)
         runs.train(args, evaluate=validator(args))
     elif not runs.is_finished(run):
         runs.resume(run, evaluate=validator(request.read_config(run)[0]))
@@ -189,20 +190,18 @@ def _train(cell: Cell, training: Training, run: Path) -> None:
         raise KeyboardInterrupt
 
 
-def _run_args(cell: Cell, training: Training, run: Path) -> request.RunArgs:
-    hyperparameters = training.resolved(cell.task)
-    if training.lessons is not None:
-        hyperparameters = replace(hyperparameters, labels=(str(run.parent / LABELS_FOLDER),))
+def _run_args(cell: Cell, step: Step) -> request.RunArgs:
+    assert cell.training is not None
     native = cell.environment.get("engine", "native") == "native"
     return request.RunArgs(
         task=cell.task,
-        hyperparameters=hyperparameters,
-        algorithm=training.algorithm,
-        folder=run,
+        hyperparameters=step.hyperparameters,
+        algorithm=step.algorithm,
+        folder=step.folder,
         env_keywords={"heuristic": cell.heuristic, **cell.environment},
         num_threads=1 if native else None,
         num_workers=None if native else 0,
-        evaluate_every=max(hyperparameters.total_timesteps // training.validations, 1),
+        evaluate_every=max(step.hyperparameters.total_timesteps // cell.training.validations, 1),
         validation_months=min(cell.months or VALIDATION_MONTHS, VALIDATION_MONTHS),
         progress=False,
     )

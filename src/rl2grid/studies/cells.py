@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,18 +11,54 @@ from rl2grid.algorithms.registry import Hyperparameters
 from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.protocol import first_months
-from rl2grid.records.studies import CELLS_FOLDER, RUN_FOLDER
+from rl2grid.records.studies import CELLS_FOLDER, LABELS_FOLDER, RUN_FOLDER
 from rl2grid.studies.toml_file import with_tuples
 from rl2grid.training import request
+
+IMITATION = "imitation"
+"""The algorithm that learns from a teacher."""
+GOES_ON = {"ppo": "ppo", "lagrangian-ppo": "ppo", "sac": "sac"}
+"""Algorithms that can go on from a pupil, and which policy it must have."""
+_INHERITED = (
+    "gamma",
+    "reward_scale",
+    "mask_actions",
+    "normalize_observations",
+    "network",
+    "shortlist",
+    "joint_actions",
+    "actor_layers",
+    "critic_layers",
+    "torch_threads",
+    "device",
+)
+"""Hyperparameters that a pupil shares with the algorithm that goes on from it."""
 
 
 @dataclass(frozen=True)
 class Lessons:
-    """Who labels what imitation learns from, with rounds on the states that the pupil meets (DAgger)."""
+    """Who labels what pupils learn from, with rounds on the states that the pupil before meets (DAgger)."""
 
     teacher: str
     rounds: tuple[int, ...]
     """Training months of each round: the teacher plays the first, the pupil of the round before the others."""
+    pupil_budget: int | None
+    """Labels that each pupil learns from where another algorithm goes on from the last one; None: the run is itself the
+    last pupil, and all have its hyperparameters."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One of the trainings of a cell, and the labels that are made before it."""
+
+    folder: Path
+    algorithm: str
+    preset: str
+    hyperparameters: Hyperparameters
+    labelled_months: int
+    """0: nothing is labelled before it."""
+    labelled_with: Path | None
+    """The pupil that plays these months; None: the teacher does."""
 
 
 @dataclass(frozen=True)
@@ -37,24 +73,64 @@ class Training:
     validations: int
     """Evaluations on the validation scenarios, spread evenly over the budget."""
     lessons: Lessons | None
-    """What is labelled before it learns, for this cell alone; None: nothing."""
+    """What is labelled and imitated before it learns, for this cell alone; None: nothing."""
 
     @property
     def rounds(self) -> tuple[int, ...]:
         """Months of each round of labels; empty where nothing is labelled."""
         return self.lessons.rounds if self.lessons else ()
 
+    @property
+    def goes_on(self) -> bool:
+        """Whether it goes on from the last pupil instead of being it."""
+        return self.lessons is not None and self.lessons.pupil_budget is not None
+
     def folders(self, cell: Path) -> list[Path]:
-        """The run folders in that of a cell, in order: a pupil for each round of labels but the last, then the run."""
-        return [*(cell / f"pupil-{number}" for number in range(1, len(self.rounds))), cell / RUN_FOLDER]
+        """The run folders in that of a cell, in order.
+
+        First pupils, one for each round of labels, then the run; it is itself the last pupil, or goes on from that.
+        """
+        pupils = len(self.rounds) if self.goes_on else len(self.rounds) - 1
+        return [*(cell / f"pupil-{number}" for number in range(1, pupils + 1)), cell / RUN_FOLDER]
 
     def resolved(self, task: Task) -> Hyperparameters:
-        """All hyperparameters, but for the folder of labels that the cell makes.
+        """All hyperparameters of the run, but for folders that the cell makes.
 
         Raises:
             UsageError: they cannot work, or not for this task.
         """
         return request.hyperparameters(self.algorithm, task, self.preset, seed=self.seed, **self.hyperparameters)
+
+    def steps(self, task: Task, cell: Path) -> list[Step]:
+        """What is labelled and trained, in order, in the folder of a cell.
+
+        Raises:
+            UsageError: as :meth:`resolved`.
+        """
+        run = self.resolved(task)
+        pupil, preset = (self._pupil(task, run), "default") if self.goes_on else (run, self.preset)
+        *pupils, last = self.folders(cell)
+        trainings = [
+            *((folder, IMITATION, preset, pupil) for folder in pupils),
+            (last, self.algorithm, self.preset, run),
+        ]
+        labelled = [*self.rounds, 0][: len(trainings)]
+        steps: list[Step] = []
+        for (folder, algorithm, origin, chosen), months in zip(trainings, labelled, strict=True):
+            before = steps[-1].folder if steps else None
+            places: dict[str, Any] = {"start_from": str(before)} if before else {}
+            if months:
+                places = {"labels": (str(cell / LABELS_FOLDER),)}
+            steps.append(Step(folder, algorithm, origin, replace(chosen, **places), months, before))
+        return steps
+
+    def _pupil(self, task: Task, run: Hyperparameters) -> Hyperparameters:
+        """The hyperparameters of pupils from whose last the run can go on."""
+        assert self.lessons is not None
+        shared = {name: getattr(run, name) for name in _INHERITED if hasattr(run, name)}
+        given = {name: value for name, value in shared.items() if name != "joint_actions" or value is not None}
+        policy, budget = GOES_ON[self.algorithm], self.lessons.pupil_budget
+        return request.hyperparameters(IMITATION, task, seed=self.seed, policy=policy, total_timesteps=budget, **given)
 
 
 @dataclass(frozen=True)

@@ -84,7 +84,7 @@ def _stage(state: CellState) -> str:
     if not state.decisions:
         return "evaluation"
     if state.tail.decisions == 0 and state.rounds:
-        return f"labels and pupils, round {state.pupils + 1} of {state.rounds}"
+        return f"labels and pupils, round {min(state.pupils + 1, state.rounds)} of {state.rounds}"
     return f"{state.tail.decisions:,} of {state.decisions:,}"
 
 

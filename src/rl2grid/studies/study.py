@@ -38,7 +38,7 @@ from rl2grid.evaluation.agents import AGENTS, kinds_of
 from rl2grid.evaluation.protocol import first_months
 from rl2grid.mdp.rewards import resolve_reward
 from rl2grid.scenarios.splits import SPLITS
-from rl2grid.studies.cells import Cell, Lessons, Study, Training
+from rl2grid.studies.cells import GOES_ON, IMITATION, Cell, Lessons, Study, Training
 from rl2grid.studies.toml_file import (
     as_table,
     check_kind,
@@ -56,8 +56,6 @@ from rl2grid.training import request
 NO_HEURISTIC = "none"
 DEFAULT_RETRIES = 2
 DEFAULT_VALIDATIONS = 10
-IMITATION = "imitation"
-"""The algorithm that learns from a teacher."""
 
 _ACTIONS = {"T": "discrete", "R": "continuous", "H": "joint"}
 
@@ -74,6 +72,7 @@ _SETTINGS = (
     "evaluation_seeds",
     "teacher",
     "rounds",
+    "pupil_budget",
 )
 """May stand in a group, a scale or the study, and count in this order."""
 
@@ -164,7 +163,8 @@ class _Group:
 
     def _cell(self, agent: str, task: Task, heuristic: str, training: Training | None) -> Cell:
         label = text(self.where, self.table, "label", "")
-        parts = [task.id.removeprefix("rl2grid/"), agent, heuristic if heuristic != NO_HEURISTIC else "", label]
+        learned = f"{agent}-from-{IMITATION}" if training is not None and training.goes_on else agent
+        parts = [task.id.removeprefix("rl2grid/"), learned, heuristic if heuristic != NO_HEURISTIC else "", label]
         if training is not None:
             parts.append(str(training.seed))
         chosen = None if heuristic == NO_HEURISTIC else heuristic
@@ -198,16 +198,37 @@ class _Group:
             changes["total_timesteps"] = count(self.where, "budget", budget, 1)
         preset = text(self.where, {"preset": self._setting("preset", "default")}, "preset")
         validations = count(self.where, "validations", self._setting("validations", DEFAULT_VALIDATIONS), 1)
-        lessons = self._lessons(task, changes) if algorithm == IMITATION else None
+        lessons = self._lessons(algorithm, task, changes)
         return Training(algorithm, seed, preset, changes, validations, lessons)
 
-    def _lessons(self, task: Task, changes: Mapping[str, Any]) -> Lessons | None:
-        """What imitation learns from: a teacher's labels, unless there are folders of labels."""
-        teacher, rounds = self._setting("teacher", None), self._setting("rounds", None)
-        if "labels" in changes:
-            if "teacher" in self.table:
-                raise UsageError(f"{upper(self.where)} has labels and a teacher, who would label again: leave out one.")
+    def _lessons(self, algorithm: str, task: Task, changes: Mapping[str, Any]) -> Lessons | None:
+        """What is labelled for imitation, and for others where the group itself has a teacher."""
+        if algorithm == IMITATION:
+            return None if self._is_given("labels", changes) else self._labelled(task, None)
+        if "teacher" not in self.table:
             return None
+        if algorithm not in GOES_ON:
+            raise UsageError(
+                f"{upper(self.where)} has a teacher and trains {algorithm}, which cannot go on from a pupil: leave "
+                f"teacher out, or choose from {', '.join((IMITATION, *GOES_ON))}."
+            )
+        if self._is_given("start_from", changes):
+            return None
+        budget = self._setting("pupil_budget", request.hyperparameters(IMITATION, task).total_timesteps)
+        return self._labelled(task, count(self.where, "pupil_budget", budget, 1))
+
+    def _is_given(self, name: str, changes: Mapping[str, Any]) -> bool:
+        """Whether what a teacher would make is there already.
+
+        Raises:
+            UsageError: and the group has a teacher all the same.
+        """
+        if name in changes and "teacher" in self.table:
+            raise UsageError(f"{upper(self.where)} has {name} and a teacher, who would label again: leave out one.")
+        return name in changes
+
+    def _labelled(self, task: Task, pupil_budget: int | None) -> Lessons:
+        teacher, rounds = self._setting("teacher", None), self._setting("rounds", None)
         if teacher is None or rounds is None:
             raise UsageError(
                 f"{upper(self.where)} trains imitation: give teacher, an agent, and rounds, the months of each round "
@@ -216,7 +237,7 @@ class _Group:
         if teacher not in AGENTS:
             raise unknown(f"{upper(self.where)}: teacher", teacher, list(AGENTS))
         self._check_agent(teacher, task)
-        return Lessons(teacher, tuple(self._counts("rounds", rounds, 1, "[200, 200]")))
+        return Lessons(teacher, tuple(self._counts("rounds", rounds, 1, "[200, 200]")), pupil_budget)
 
     def _changes(self, algorithm: str) -> dict[str, Any]:
         """Hyperparameters of the group: those of all its algorithms, then those of this one."""
@@ -304,8 +325,10 @@ def _check_training_and_constraint(cell: Cell) -> None:
     if cell.training is None:
         constraint_of(cell.task, cell.environment.get("constraint"))
         return
-    hyperparameters, algorithm = cell.training.resolved(cell.task), cell.training.algorithm
-    request.find_limits(request.RunArgs(cell.task, hyperparameters, algorithm, env_keywords=cell.environment))
+    for step in cell.training.steps(cell.task, Path(cell.name)):
+        request.find_limits(
+            request.RunArgs(cell.task, step.hyperparameters, step.algorithm, env_keywords=cell.environment)
+        )
 
 
 def _chosen_scale(scales: Mapping[str, Any], asked: str | None) -> str | None:
