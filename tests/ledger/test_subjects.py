@@ -125,6 +125,20 @@ def test_what_a_training_learned_from_counts_by_content_and_seeds_are_one_choice
     assert choice_hash(found[0]) != choice_hash(found[0] | {"labels": {"labels": ["bad"]}})
 
 
+def test_a_policy_of_the_same_budget_begins_the_same_choice_whatever_its_best_one_is_from():
+    def begun(**start: Any) -> dict[str, Any]:
+        learned = {"algorithm": "imitation", "path": "a", "policy_hash": "1", **start}
+        return {"algorithm": "ppo", **subjects._learned_from({"start": learned})}
+
+    first, other, longer = (
+        begun(decisions=10, budget=40),
+        begun(decisions=20, budget=40),
+        begun(decisions=10, budget=80),
+    )
+    assert first != other
+    assert choice_hash(first) == choice_hash(other) != choice_hash(longer)
+
+
 def test_labels_of_as_many_other_months_repeat_a_training_and_choose_nothing():
     def learned_from(contents: str, months: list[int]) -> dict[str, Any]:
         labels = {"teacher": "greedy", "rounds": 2, "months": [months], "labels": [contents], "grid_hash": "0"}

@@ -38,7 +38,8 @@ class StartingPolicy:
 
     def identity(self) -> dict[str, Any]:
         """What results of a run that begins with it must name."""
-        return {name: getattr(self, name) for name in ("path", "algorithm", "decisions", "policy_hash")}
+        named = {name: getattr(self, name) for name in ("path", "algorithm", "decisions", "policy_hash")}
+        return {**named, "budget": self.hyperparameters.get("total_timesteps")}
 
     def state_dict(self) -> dict[str, Any]:
         """Plain values, arrays and tensors of which it is made again."""

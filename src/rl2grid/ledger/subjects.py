@@ -168,7 +168,7 @@ def _learned_from(identity: Mapping[str, Any]) -> dict[str, Any]:
     if "labels" in identity:
         found["labels"] = {name: value for name, value in identity["labels"].items() if name in _OF_LABELS}
     if "start" in identity:
-        found[STARTED_FROM] = {name: identity["start"][name] for name in ("algorithm", "decisions", "policy_hash")}
+        found[STARTED_FROM] = {name: value for name, value in identity["start"].items() if name != "path"}
     return found
 
 

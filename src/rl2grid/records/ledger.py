@@ -18,7 +18,7 @@ from rl2grid.records.evaluations import Evaluation, identity_hash
 from rl2grid.records.files import CHECKSUM, checksum, misfit, not_what, read_json, write_json
 from rl2grid.records.locks import locked
 from rl2grid.records.month_values import pack_months
-from rl2grid.records.trainings import chosen_of_labels
+from rl2grid.records.trainings import chosen_of_labels, chosen_of_start
 
 _REMEDY = "give a file that 'rl2grid leaderboard test' wrote, or one that does not exist yet"
 _TEST = {
@@ -118,20 +118,20 @@ def agent_of(configuration: Mapping[str, Any]) -> str:
 def choice_hash(configuration: Mapping[str, Any]) -> str:
     """Hash of what was chosen: a configuration without its seed, which repeats a training and chooses nothing.
 
-    So do a policy that it began with, if that is another one of the same algorithm, however many decisions its best one
-    is from, and labels of as many other months by the same teacher.
+    So do a policy that it began with, if that is another one of the same algorithm and budget, and labels of as many
+    other months by the same teacher.
     """
     chosen = dict(configuration)
     chosen["hyperparameters"] = _without(configuration.get("hyperparameters", {}), "seed")
     if STARTED_FROM in configuration:
-        chosen[STARTED_FROM] = _without(configuration[STARTED_FROM], "policy_hash", "decisions")
+        chosen[STARTED_FROM] = chosen_of_start(configuration[STARTED_FROM])
     if LABELS in configuration:
         chosen[LABELS] = chosen_of_labels(configuration[LABELS])
     return identity_hash(chosen)
 
 
-def _without(values: Mapping[str, Any], *names: str) -> dict[str, Any]:
-    return {key: value for key, value in values.items() if key not in names}
+def _without(values: Mapping[str, Any], name: str) -> dict[str, Any]:
+    return {key: value for key, value in values.items() if key != name}
 
 
 def hashed_test(

@@ -188,6 +188,15 @@ def chosen_of_labels(identity: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in identity.items() if name != "labels" or "months" not in identity}
 
 
+def chosen_of_start(identity: Mapping[str, Any]) -> dict[str, Any]:
+    """What repeated trainings have in common of the policy that they began with: the algorithm and its budget.
+
+    Where the budget is not told, as of early trainings, how many decisions the policy is from tells starts apart.
+    """
+    left_out = {"policy_hash"} | ({"decisions"} if identity.get("budget") is not None else set())
+    return {name: value for name, value in identity.items() if name not in left_out}
+
+
 def read_training_run(folder: Path, label: str | None = None) -> TrainingRun:
     """A run, finished or still going on.
 
