@@ -85,7 +85,7 @@ def test_ppo_begins_with_exactly_the_policy_that_it_is_given(tmp_path: Path, tas
             "algorithm": "ppo",
             "decisions": 96,
             "policy_hash": agent.identity["policy_hash"],
-            "budget": 96,
+            "budget": mine.args.total_timesteps,
         }
     }
 
