@@ -25,18 +25,22 @@ def test_methods_of_several_trainings_are_compared_on_the_months_that_all_played
         trained(2, [0.6, 0.9]),
         trained(1, [0.9, 0.9], algorithm="dqn"),  # a single one has no cell
         on(other, trained(3, [0.5, 0.5])),
+        on(other, trained(1, [0.4, 0.4], algorithm="imitation")),
+        on(other, trained(2, [0.4, 0.4], algorithm="imitation")),
         on(other, trained(4, [0.5, 0.5])),
         on(other, trained(5, [0.9, 0.9], steps=2000)),  # more decisions than most tasks had
         on(other, trained(6, [0.9, 0.9], steps=2000)),
     )
     lines = learned_table(results).splitlines()
-    assert lines[0] == "| task | months | do nothing | search and rules | planner | ppo, 1,000 |"
+    methods = "imitation, 1,000 labels | ppo, 1,000"
+    assert lines[0] == f"| task | months | do nothing | search and rules | planner | {methods} |"
     cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines[2:]]
-    assert cells[0][:5] == ["bus14-T0", "2", "0.150", "0.650", ""]
-    assert cells[0][5].startswith("**0.800 [")
-    assert cells[0][5].endswith("]** (2)")
+    assert cells[0][:6] == ["bus14-T0", "2", "0.150", "0.650", "", ""]
+    assert cells[0][6].startswith("**0.800 [")
+    assert cells[0][6].endswith("]** (2)")
     assert cells[1][:5] == ["bus36-M-T0", "2", "", "", ""]
-    assert cells[1][5].startswith("**0.500 [")
+    assert cells[1][5].startswith("0.400 [")
+    assert cells[1][6].startswith("**0.500 [")
 
 
 def test_a_ledger_without_repeated_trainings_is_refused():

@@ -15,6 +15,7 @@ from rl2grid.records.statistics import aggregated, estimate
 
 SEVERAL = 2
 """Trainings that a method needs to have a cell."""
+IMITATION = "imitation"
 BESIDE = KINDS[:-1]
 """What learned nothing, the best of each kind."""
 
@@ -36,7 +37,7 @@ def learned_table(results: Mapping[str, HashedTest]) -> str:
     decisions = _commonest([row for each in learned.values() for row in each])
     if not decisions:
         raise UsageError("No configuration of this ledger was trained with several seeds: test more of a run's seeds.")
-    names = ["task", "months", *BESIDE, *(f"{player}, {number:,}" for player, number in decisions.items())]
+    names = ["task", "months", *BESIDE, *(_headed(player, number) for player, number in decisions.items())]
     lines = [markdown_row(names), "|:--|" + "--:|" * (len(names) - 1)]
     for task, each in rows.items():
         chosen = [_chosen(learned[task], player, number) for player, number in decisions.items()]
@@ -44,6 +45,11 @@ def learned_table(results: Mapping[str, HashedTest]) -> str:
             beside = [best_row([row for row in each if kind_of(row.first) == kind]) for kind in BESIDE]
             lines.append(markdown_row([short_id(task), *_cells([*beside, *chosen])]))
     return "\n".join(lines)
+
+
+def _headed(player: str, number: int) -> str:
+    """A method and what it learned from: of imitation, which plays nothing, that are labels."""
+    return f"{player}, {number:,} labels" if player.split(",")[0] == IMITATION else f"{player}, {number:,}"
 
 
 def _commonest(rows: Sequence[LedgerRow]) -> dict[str, int]:
