@@ -12,6 +12,7 @@ from rl2grid.analysis.ledger_figure import draw_ledger
 from rl2grid.analysis.ledger_overview import overview_table
 from rl2grid.analysis.ledger_table import LEGEND, ledger_table, short_ledger_table
 from rl2grid.errors import UsageError
+from rl2grid.records.ledger import HashedTest
 from rl2grid.records.ledger import hashed_test, read_ledger
 
 ROOT = Path(__file__).parents[2]
@@ -63,6 +64,17 @@ def test_what_cannot_be_compared_is_marked():
     assert sorted(rows) == ["", "a1 b", "a2 s t"]
     to_ppo = ledger_table(results, TASK, "ppo + idle")
     assert to_ppo.count("other budget") >= 1
+
+
+def test_configurations_of_one_label_and_budget_are_told_apart_by_their_hyperparameters():
+    def wide(seed: int, layers: list[int], steps: int = 1000) -> HashedTest:
+        hyperparameters = {"seed": seed, "total_timesteps": steps, "gamma": 0.9, "layers": layers}
+        return trained(seed, [0.6, 0.8], steps=steps, hyperparameters=hyperparameters)
+
+    results = ledger(wide(1, [64, 32]), wide(2, [64, 32]), wide(1, [8]), wide(1, [4], steps=5000))
+    agents = sorted(line.split("|")[2].strip() for line in ledger_table(results).splitlines()[2:-2])
+    assert agents == ["ppo", "ppo (layers 64 32)", "ppo (layers 8)"]
+    assert "| ppo + idle (layers 8) |" in short_ledger_table(results, TASK).replace("**", "")
 
 
 def test_what_later_rules_of_an_agent_replaced_is_marked_and_left_out_of_short_tables():

@@ -61,7 +61,7 @@ def _name(row: LedgerRow) -> str:
     if not row.first.training:
         return row.first.label
     seeds = f", {len(row.results)} seeds" if len(row.results) > 1 else ""
-    return f"{row.first.label} ({row.first.training['decisions']:,} decisions{seeds})"
+    return f"{row.label} ({row.first.training['decisions']:,} decisions{seeds})"
 
 
 def _legend(theme: Theme) -> list[Line2D]:

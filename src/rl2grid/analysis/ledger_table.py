@@ -61,10 +61,22 @@ class LedgerRow:
     results: tuple[HashedTest, ...]
     marks: str
     """What the legend explains."""
+    told_by: str
+    """The hyperparameters that tell it from rows of the same label and budget; empty where there are none."""
 
     @property
     def first(self) -> HashedTest:
         return self.results[0]
+
+    @property
+    def player(self) -> str:
+        """See :attr:`HashedTest.player`, and what tells it from others."""
+        return f"{self.first.player}{self.told_by}"
+
+    @property
+    def label(self) -> str:
+        """See :attr:`HashedTest.label`, and what tells it from others."""
+        return f"{self.first.label}{self.told_by}"
 
     def scores(self, column: str, months: int | None = None, *, of_last: bool = False) -> Scores:
         """A column of the tests, seeds of the training as runs; the first ``months`` of them."""
@@ -121,7 +133,7 @@ def short_ledger_table(results: Mapping[str, HashedTest], task: str) -> str:
         survival = with_interval(estimate(row.scores("survival")), 3)
         difference = compared.get(number)
         cells = (
-            f"**{row.first.label}**" if place == 0 else row.first.label,
+            f"**{row.label}**" if place == 0 else row.label,
             f"**{survival}**" if place == 0 else survival,
             difference_cell(difference).text if isinstance(difference, Difference) else difference or "",
             share_text(estimate(row.scores("completed"))),
@@ -153,7 +165,34 @@ def ledger_rows(shown: Mapping[str, HashedTest], results: Mapping[str, HashedTes
         if first.training:
             budgets.setdefault((first.task, first.heuristic), Counter())[budget(first)] += 1
     usual = {key: max(counts, key=lambda one: (counts[one], dict(one)["decisions"])) for key, counts in budgets.items()}
-    return [LedgerRow(tuple(group), _marks(group, usual, results)) for group in groups]
+    told_by = _told_by([first for first, *_ in groups])
+    return [
+        LedgerRow(tuple(group), _marks(group, usual, results), words)
+        for group, words in zip(groups, told_by, strict=True)
+    ]
+
+
+def _told_by(choices: Sequence[HashedTest]) -> list[str]:
+    """Of each choice, the hyperparameters in which those of one task, label and budget differ, in words."""
+    alike: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
+    keys = []
+    for one in choices:
+        chosen = one.configuration.get("hyperparameters", {})
+        keys.append((one.task, one.label, chosen.get("total_timesteps")))
+        alike.setdefault(keys[-1], []).append(chosen)
+    return [
+        _in_words(one.configuration.get("hyperparameters", {}), alike[key])
+        for one, key in zip(choices, keys, strict=True)
+    ]
+
+
+def _in_words(chosen: Mapping[str, Any], others: Sequence[Mapping[str, Any]]) -> str:
+    differing = [
+        f"{name} {' '.join(map(str, value)) if isinstance(value, list | tuple) else value}"
+        for name, value in chosen.items()
+        if name != "seed" and any(other.get(name) != value for other in others)
+    ]
+    return f" ({', '.join(differing)})" if differing else ""
 
 
 def _marks(
@@ -214,7 +253,7 @@ def _place(result: HashedTest) -> tuple[Any, ...]:
 
 def _cells(row: LedgerRow, compared: Difference | str | None) -> list[str]:
     first, training = row.first, [result.training for result in row.results]
-    cells = [short_id(first.task), first.player, first.heuristic or "none", _months(first)]
+    cells = [short_id(first.task), row.player, first.heuristic or "none", _months(first)]
     if first.training:
         steps = sum(run["grid_steps"] for run in training) / len(training) / 1e6
         minutes, validation = ([run[name] for run in training] for name in ("minutes", "validation_survival"))
