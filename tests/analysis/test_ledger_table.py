@@ -12,8 +12,7 @@ from rl2grid.analysis.ledger_figure import draw_ledger
 from rl2grid.analysis.ledger_overview import overview_table
 from rl2grid.analysis.ledger_table import LEGEND, ledger_table, short_ledger_table
 from rl2grid.errors import UsageError
-from rl2grid.records.ledger import HashedTest
-from rl2grid.records.ledger import hashed_test, read_ledger
+from rl2grid.records.ledger import HashedTest, hashed_test, read_ledger
 
 ROOT = Path(__file__).parents[2]
 

@@ -60,14 +60,15 @@ def test_a_short_table_has_the_best_first():
 def test_the_first_page_says_what_was_measured():
     results = read_ledger(LEDGER)
 
-    def survivals(task, *agents, decisions=None):
+    def survivals(task, *agents, decisions=None, trainings=1):
         of_task = {k: one for k, one in results.items() if one.task == find_task(task).id}
         chosen = [row for row in ledger_rows(of_task, results) if agent_of(row.first.configuration) in agents]
         if decisions is not None:
             chosen = [
                 row for row in chosen if row.first.configuration["hyperparameters"]["total_timesteps"] == decisions
             ]
-        return sorted(estimate(row.scores("survival")).value for row in chosen)
+        repeated = [row for row in chosen if len(row.results) >= trainings]
+        return sorted(estimate(row.scores("survival")).value for row in repeated)
 
     page = " ".join((ROOT / "docs" / "index.md").read_text(encoding="utf-8").split())
     assert f"**{survivals('bus14-T0', 'greedy', 'planner')[-1]:.1%}** of a month" in page
@@ -75,6 +76,6 @@ def test_the_first_page_says_what_was_measured():
     assert f"**{100 * learned[0]:.0f} to {learned[-1]:.0%}** there by agents that learned" in page
     assert f"**{survivals('bus36-MO-v0-T1', 'greedy')[-1]:.0%}** by the same search" in page
     assert f"**{survivals('bus36-MO-v0-T1', 'planner')[-1]:.0%}** by the planner's sequences" in page
-    worse, better = survivals("bus36-MO-v0-T0", "ppo", decisions=2_000_000)
-    assert f"**{100 * worse:.0f} and {better:.0%}** there, with fewer actions" in page
+    *_, best = survivals("bus36-MO-v0-T0", "ppo", decisions=2_000_000, trainings=5)
+    assert f"**{best:.0%}** there, with fewer actions, by PPO" in page
     assert f"the search comes to {survivals('bus36-MO-v0-T0', 'greedy')[-1]:.0%} (500" in page
