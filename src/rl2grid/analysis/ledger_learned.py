@@ -15,9 +15,10 @@ from rl2grid.records.statistics import aggregated, estimate
 
 SEVERAL = 2
 """Trainings that a method needs to have a cell."""
-IMITATION = "imitation"
 BESIDE = KINDS[:-1]
 """What learned nothing, the best of each kind."""
+IMITATION = "imitation"
+"""The algorithm that learns from labels."""
 
 
 def learned_table(results: Mapping[str, HashedTest]) -> str:

@@ -231,7 +231,7 @@ class _Group:
         teacher, rounds = self._setting("teacher", None), self._setting("rounds", None)
         if teacher is None or rounds is None:
             raise UsageError(
-                f"{upper(self.where)} trains imitation: give teacher, an agent, and rounds, the months of each round "
+                f"{upper(self.where)} trains pupils: give teacher, an agent, and rounds, the months of each round "
                 "of labels such as [200, 200], or hyperparameters.labels, folders that 'rl2grid teach' wrote."
             )
         if teacher not in AGENTS:
