@@ -12,13 +12,12 @@ from rl2grid.envs.tasks import short_id
 from rl2grid.errors import UsageError
 from rl2grid.records.ledger import HashedTest
 from rl2grid.records.statistics import aggregated, estimate
+from rl2grid.records.trainings import IMITATION
 
 SEVERAL = 2
 """Trainings that a method needs to have a cell."""
 BESIDE = KINDS[:-1]
 """What learned nothing, the best of each kind."""
-IMITATION = "imitation"
-"""The algorithm that learns from labels."""
 
 
 def learned_table(results: Mapping[str, HashedTest]) -> str:

@@ -16,7 +16,7 @@ from rl2grid.errors import one_of
 from rl2grid.mdp.constraint_table import CONSTRAINTS, THRESHOLDS
 from rl2grid.records.comparisons import Difference, holm, paired_differences
 from rl2grid.records.ledger import HashedTest
-from rl2grid.records.looks import budget, by_present_rules, earlier_choices, is_outdated, method_of
+from rl2grid.records.looks import budget, by_present_rules, earlier_choices, is_outdated, latest_rules, method_of
 from rl2grid.records.month_values import common_months, unpack_months
 from rl2grid.records.statistics import UNIT, Scores, estimate
 from rl2grid.records.versions import TARGETS_VERSION
@@ -165,28 +165,27 @@ def ledger_rows(shown: Mapping[str, HashedTest], results: Mapping[str, HashedTes
         if first.training:
             budgets.setdefault((first.task, first.heuristic), Counter())[budget(first)] += 1
     usual = {key: max(counts, key=lambda one: (counts[one], dict(one)["decisions"])) for key, counts in budgets.items()}
-    told_by = _told_by([first for first, *_ in groups])
+    told_by, latest = _told_by([first for first, *_ in groups]), latest_rules(results)
     return [
-        LedgerRow(tuple(group), _marks(group, usual, results), words)
+        LedgerRow(tuple(group), _marks(group, usual, latest, results), words)
         for group, words in zip(groups, told_by, strict=True)
     ]
 
 
 def _told_by(choices: Sequence[HashedTest]) -> list[str]:
     """Of each choice, the hyperparameters in which those of one task, label and budget differ, in words."""
-    alike: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
-    keys = []
-    for one in choices:
-        chosen = one.configuration.get("hyperparameters", {})
-        keys.append((one.task, one.label, chosen.get("total_timesteps")))
-        alike.setdefault(keys[-1], []).append(chosen)
-    return [
-        _in_words(one.configuration.get("hyperparameters", {}), alike[key])
-        for one, key in zip(choices, keys, strict=True)
+    hyperparameters = [one.configuration.get("hyperparameters", {}) for one in choices]
+    keys = [
+        (one.task, one.label, chosen.get("total_timesteps"))
+        for one, chosen in zip(choices, hyperparameters, strict=True)
     ]
+    alike: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
+    for key, chosen in zip(keys, hyperparameters, strict=True):
+        alike.setdefault(key, []).append(chosen)
+    return [_differing(chosen, alike[key]) for key, chosen in zip(keys, hyperparameters, strict=True)]
 
 
-def _in_words(chosen: Mapping[str, Any], others: Sequence[Mapping[str, Any]]) -> str:
+def _differing(chosen: Mapping[str, Any], others: Sequence[Mapping[str, Any]]) -> str:
     differing = [
         f"{name} {' '.join(map(str, value)) if isinstance(value, list | tuple) else value}"
         for name, value in chosen.items()
@@ -196,12 +195,15 @@ def _in_words(chosen: Mapping[str, Any], others: Sequence[Mapping[str, Any]]) ->
 
 
 def _marks(
-    group: Sequence[HashedTest], usual: Mapping[tuple[str, Any], tuple[Any, ...]], results: Mapping[str, HashedTest]
+    group: Sequence[HashedTest],
+    usual: Mapping[tuple[str, Any], tuple[Any, ...]],
+    latest: Mapping[tuple[Any, ...], int],
+    results: Mapping[str, HashedTest],
 ) -> str:
     first = group[0]
     seen = len(earlier_choices(results, method_of(first), first.choice))
     marks = [f"a{seen}"] if seen else []
-    marks += ["r"] if is_outdated(first, results) else []
+    marks += ["r"] if is_outdated(first, latest) else []
     if first.training:
         marks += ["b"] if budget(first) != usual[first.task, first.heuristic] else []
         marks += ["s"] if any(one.training.get("tested_before") for one in group) else []

@@ -47,17 +47,23 @@ def earlier_choices(results: Mapping[str, HashedTest], method: tuple[Any, ...], 
     return seen
 
 
-def is_outdated(result: HashedTest, results: Mapping[str, HashedTest]) -> bool:
-    """Whether an agent without training has had a test on the task by later rules than these, with any heuristic."""
-    return any(other.rules > result.rules and _played_by(other) == _played_by(result) for other in results.values())
+def latest_rules(results: Mapping[str, HashedTest]) -> dict[tuple[Any, ...], int]:
+    """By what latest rules an agent has had a test on a task, with any heuristic; for :func:`is_outdated`."""
+    latest: dict[tuple[Any, ...], int] = {}
+    for one in results.values():
+        latest[_played_by(one)] = max(one.rules, latest.get(_played_by(one), one.rules))
+    return latest
+
+
+def is_outdated(result: HashedTest, latest: Mapping[tuple[Any, ...], int]) -> bool:
+    """Whether an agent without training has had a test by later rules, of :func:`latest_rules`, than this one."""
+    return result.rules < latest[_played_by(result)]
 
 
 def by_present_rules(results: Mapping[str, HashedTest]) -> dict[str, HashedTest]:
     """Without what is outdated."""
-    latest: dict[tuple[Any, ...], int] = {}
-    for one in results.values():
-        latest[_played_by(one)] = max(one.rules, latest.get(_played_by(one), one.rules))
-    return {digest: one for digest, one in results.items() if one.rules == latest[_played_by(one)]}
+    latest = latest_rules(results)
+    return {digest: one for digest, one in results.items() if not is_outdated(one, latest)}
 
 
 def method_of(result: HashedTest) -> tuple[Any, ...]:

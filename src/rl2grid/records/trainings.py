@@ -16,6 +16,8 @@ from rl2grid.errors import UsageError
 from rl2grid.records.files import make_folder, read_json, set_aside, write_record
 from rl2grid.records.metrics import EPISODES, METRICS_FILE, SURVIVAL, VALIDATION, read_rows
 
+IMITATION = "imitation"
+"""The algorithm that learns from labels and plays nothing."""
 RUN_FILE, ENERGY_FILE, TRACKING_FILE = "config.json", "energy.json", "wandb.json"
 _COLUMNS = ("step", "grid_steps", "name", "value")
 _CONFIGURATION = {

@@ -26,6 +26,7 @@ import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from rl2grid.algorithms.registry import Hyperparameters
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.flags import evaluate_command
 from rl2grid.evaluation.protocol import evaluate
@@ -35,7 +36,6 @@ from rl2grid.records.metrics import trained_seconds
 from rl2grid.records.studies import (
     CELL_FILE,
     EVALUATION_FOLDER,
-    LABELS_FOLDER,
     CellResult,
     read_cell,
     read_result,
@@ -43,7 +43,7 @@ from rl2grid.records.studies import (
     write_result,
 )
 from rl2grid.scenarios.splits import VALIDATION_MONTHS
-from rl2grid.studies.cells import Cell, Step, cell_from_dict, cell_to_dict
+from rl2grid.studies.cells import Cell, Round, Step, cell_from_dict, cell_to_dict
 from rl2grid.training import request, runs
 from rl2grid.training.commands import teach_command, train_command
 from rl2grid.training.teaching import PUPIL_SHARE, THIN, teach
@@ -78,8 +78,8 @@ def commands(folder: Path, cell: Cell) -> list[str]:
     """What to type to obtain the cell by hand."""
     keywords, lines, agent = {"heuristic": cell.heuristic, **cell.environment}, [], cell.agent
     for step in _steps(folder, cell):
-        if step.labelled_months:
-            lines.append(_teach_command(cell, step))
+        if step.round is not None:
+            lines.append(_teach_command(cell, step.round, step.hyperparameters))
         lines.append(train_command(_run_args(cell, step), step.preset, step.folder))
         agent = str(step.folder)
     return [*lines, evaluate_command(agent, cell.task, cell.split, cell.evaluation_seeds, cell.months, keywords)]
@@ -89,20 +89,18 @@ def _steps(folder: Path, cell: Cell) -> list[Step]:
     return [] if cell.training is None else cell.training.steps(cell.task, folder)
 
 
-def _teach_command(cell: Cell, step: Step) -> str:
-    assert cell.training is not None
-    assert cell.training.lessons is not None
+def _teach_command(cell: Cell, labelled: Round, hyperparameters: Hyperparameters) -> str:
     return teach_command(
-        cell.training.lessons.teacher,
+        labelled.teacher,
         cell.task,
         {"heuristic": cell.heuristic, **cell.environment},
-        months=step.labelled_months,
-        seed=cell.training.seed,
-        pupil=step.labelled_with,
+        months=labelled.months,
+        seed=hyperparameters.seed,
+        pupil=labelled.pupil,
         pupil_share=PUPIL_SHARE,
-        gamma=step.hyperparameters.gamma,
+        gamma=hyperparameters.gamma,
         thin=THIN,
-        output=step.folder.parent / LABELS_FOLDER,
+        output=labelled.folder,
     )
 
 
@@ -127,8 +125,8 @@ def _finish(folder: Path) -> None:
     agent: str | Path = cell.agent
     steps = _steps(folder, cell)
     for step in steps:
-        if step.labelled_months:
-            _teach(cell, step)
+        if step.round is not None:
+            _teach(cell, step.round, step.hyperparameters)
         _train(cell, step)
         agent = step.folder
     result = evaluate(
@@ -155,21 +153,19 @@ def _finish(folder: Path) -> None:
     write_result(folder, summary)
 
 
-def _teach(cell: Cell, step: Step) -> None:
+def _teach(cell: Cell, labelled: Round, hyperparameters: Hyperparameters) -> None:
     """Label a round, or what is missing of it."""
-    assert cell.training is not None
-    assert cell.training.lessons is not None
     teach(
-        cell.training.lessons.teacher,
+        labelled.teacher,
         cell.task,
-        months=step.labelled_months,
-        output=step.folder.parent / LABELS_FOLDER,
-        seed=cell.training.seed,
+        months=labelled.months,
+        output=labelled.folder,
+        seed=hyperparameters.seed,
         heuristic=cell.heuristic,
-        pupil=step.labelled_with,
-        gamma=step.hyperparameters.gamma,
+        pupil=labelled.pupil,
+        gamma=hyperparameters.gamma,
         workers=0,
-        command=_teach_command(cell, step),
+        command=_teach_command(cell, labelled, hyperparameters),
         **cell.environment,
     )
 
@@ -191,7 +187,6 @@ def _train(cell: Cell, step: Step) -> None:
 
 
 def _run_args(cell: Cell, step: Step) -> request.RunArgs:
-    assert cell.training is not None
     native = cell.environment.get("engine", "native") == "native"
     return request.RunArgs(
         task=cell.task,
@@ -201,7 +196,7 @@ def _run_args(cell: Cell, step: Step) -> request.RunArgs:
         env_keywords={"heuristic": cell.heuristic, **cell.environment},
         num_threads=1 if native else None,
         num_workers=None if native else 0,
-        evaluate_every=max(step.hyperparameters.total_timesteps // cell.training.validations, 1),
+        evaluate_every=step.evaluate_every,
         validation_months=min(cell.months or VALIDATION_MONTHS, VALIDATION_MONTHS),
         progress=False,
     )

@@ -12,11 +12,10 @@ from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.protocol import first_months
 from rl2grid.records.studies import CELLS_FOLDER, LABELS_FOLDER, RUN_FOLDER
+from rl2grid.records.trainings import IMITATION
 from rl2grid.studies.toml_file import with_tuples
 from rl2grid.training import request
 
-IMITATION = "imitation"
-"""The algorithm that learns from a teacher."""
 GOES_ON = {"ppo": "ppo", "lagrangian-ppo": "ppo", "sac": "sac"}
 """Algorithms that can go on from a pupil, and which policy it must have."""
 _INHERITED = (
@@ -48,17 +47,29 @@ class Lessons:
 
 
 @dataclass(frozen=True)
+class Round:
+    """Training months that a teacher labels."""
+
+    teacher: str
+    months: int
+    pupil: Path | None
+    """Who plays them; None: the teacher."""
+    folder: Path
+    """Of the labels."""
+
+
+@dataclass(frozen=True)
 class Step:
-    """One of the trainings of a cell, and the labels that are made before it."""
+    """One of the trainings of a cell."""
 
     folder: Path
     algorithm: str
     preset: str
     hyperparameters: Hyperparameters
-    labelled_months: int
-    """0: nothing is labelled before it."""
-    labelled_with: Path | None
-    """The pupil that plays these months; None: the teacher does."""
+    evaluate_every: int
+    """Decisions between two evaluations on the validation scenarios."""
+    round: Round | None
+    """What is labelled before it; None: nothing."""
 
 
 @dataclass(frozen=True)
@@ -114,15 +125,22 @@ class Training:
             *((folder, IMITATION, preset, pupil) for folder in pupils),
             (last, self.algorithm, self.preset, run),
         ]
-        labelled = [*self.rounds, 0][: len(trainings)]
         steps: list[Step] = []
-        for (folder, algorithm, origin, chosen), months in zip(trainings, labelled, strict=True):
+        for number, (folder, algorithm, origin, chosen) in enumerate(trainings):
             before = steps[-1].folder if steps else None
+            labelled = self._round(number, before, cell)
             places: dict[str, Any] = {"start_from": str(before)} if before else {}
-            if months:
-                places = {"labels": (str(cell / LABELS_FOLDER),)}
-            steps.append(Step(folder, algorithm, origin, replace(chosen, **places), months, before))
+            if labelled:
+                places = {"labels": (str(labelled.folder),)}
+            every = max(chosen.total_timesteps // self.validations, 1)
+            steps.append(Step(folder, algorithm, origin, replace(chosen, **places), every, labelled))
         return steps
+
+    def _round(self, number: int, pupil: Path | None, cell: Path) -> Round | None:
+        """What is labelled before training ``number``; nothing before one that goes on from the last pupil."""
+        if self.lessons is None or number >= len(self.lessons.rounds):
+            return None
+        return Round(self.lessons.teacher, self.lessons.rounds[number], pupil, cell / LABELS_FOLDER)
 
     def _pupil(self, task: Task, run: Hyperparameters) -> Hyperparameters:
         """The hyperparameters of pupils from whose last the run can go on."""

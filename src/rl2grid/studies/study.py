@@ -37,8 +37,9 @@ from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import AGENTS, kinds_of
 from rl2grid.evaluation.protocol import first_months
 from rl2grid.mdp.rewards import resolve_reward
+from rl2grid.records.trainings import IMITATION
 from rl2grid.scenarios.splits import SPLITS
-from rl2grid.studies.cells import GOES_ON, IMITATION, Cell, Lessons, Study, Training
+from rl2grid.studies.cells import GOES_ON, Cell, Lessons, Study, Training
 from rl2grid.studies.toml_file import (
     as_table,
     check_kind,
