@@ -1,6 +1,7 @@
 """Structures: everything that follows from the declaration of a field."""
 
-from typing import Annotated, NamedTuple
+from types import GenericAlias
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -36,11 +37,22 @@ class Example(NamedTuple):
     step: Annotated[F64, workspace("line line")]
 
 
+class Spelled(NamedTuple):
+    """``NDArray[np.float32]``, as NumPy spells it up to 2.4, and as from 2.5 on: an alias with the scalar alone."""
+
+    before: Annotated[np.ndarray[Any, np.dtype[np.float32]], row("line")]
+    after: Annotated[GenericAlias(list, (np.float32,)), row("line")]  # type: ignore[valid-type]
+
+
 class Outer(NamedTuple):
     """A structure in a structure."""
 
     count: Annotated[I32, constant("1")]
     example: Example
+
+
+def test_the_type_of_numbers_is_read_from_both_spellings_of_numpy():
+    assert [field.dtype for field in fields_of(Spelled).values()] == [np.float32, np.float32]
 
 
 def test_allocation_follows_from_the_declaration():

@@ -149,8 +149,9 @@ def declaration_of(kind: type[tuple[Any, ...]]) -> Declaration:
 
 
 def _dtype_of(array: Any) -> np.dtype[Any]:
-    """The dtype of ``NDArray[dtype]``."""
-    dtype: np.dtype[Any] = np.dtype(get_args(get_args(array)[1])[0])
+    """The dtype of ``NDArray[scalar]``, which up to NumPy 2.4 is another name of ``ndarray[shape, dtype[scalar]]``."""
+    last = get_args(array)[-1]
+    dtype: np.dtype[Any] = np.dtype(get_args(last)[0] if get_origin(last) is np.dtype else last)
     return dtype
 
 
