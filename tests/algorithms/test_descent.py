@@ -56,6 +56,40 @@ def test_the_same_weights_as_with_pytorchs_optimiser_whatever_is_resumed_or_skip
         assert weights(ours) == weights(theirs)
 
 
+class Joined(nn.Module):
+    """Two layers that are multiplied at once, a third by its columns, biases that are added.
+
+    The gradients lie in memory as their weights do not, and those of the biases are one.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.left, self.right = nn.Parameter(torch.randn(4, 5)), nn.Parameter(torch.randn(4, 5))
+        self.turned = nn.Parameter(torch.randn(8, 2))
+        self.first, self.second = nn.Parameter(torch.randn(4)), nn.Parameter(torch.randn(4))
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        joined = torch.cat([self.left, self.right], dim=1)
+        outputs = torch.mm(torch.cat([inputs, inputs.cos()], dim=1), joined.t()) + (self.first + self.second)
+        return outputs @ self.turned.t()[:, :4].t()
+
+
+@pytest.mark.parametrize("fused", [False, True])
+def test_gradients_that_lie_otherwise_than_their_weights_or_in_one_place(fused: bool):
+    ours, theirs = Joined(), Joined()
+    raw = torch.autograd.grad(loss(ours, 0), list(ours.parameters()))
+    assert any(gradient.stride() != weight.stride() for gradient, weight in zip(raw, ours.parameters(), strict=True))
+    assert raw[3].data_ptr() == raw[4].data_ptr()
+    optimizer = Adam(ours.parameters(), lr=3e-3)
+    reference = torch.optim.Adam(theirs.parameters(), lr=3e-3, fused=fused)
+    for step in range(4):
+        descend(optimizer, loss(ours, step), 0.1)
+        pytorchs_step(reference, loss(theirs, step), 0.1)
+    for mine, other in zip(ours.parameters(), theirs.parameters(), strict=True):
+        torch.testing.assert_close(mine, other, rtol=1e-6, atol=1e-6)
+
+
 def test_only_the_weights_of_the_optimiser_get_gradients():
     moved, seen = network(), network(1)
     descend(Adam(moved.parameters(), lr=1e-3), loss(seen, 0) * loss(moved, 0), 1.0)

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
+from rl2grid.algorithms.descent import Adam, descend
 from rl2grid.algorithms.networks import (
     NEVER,
     PER_ACTION,
@@ -63,6 +64,34 @@ def observations(spec: Spec, n: int, *, split: float = 0.1, seed: int = 0) -> Te
 
 
 # --- What every network must do -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
+@pytest.mark.parametrize("network", ["mlp", *NETWORKS])
+@pytest.mark.parametrize(
+    ("spec", "output"),
+    [(spec_of_task("bus14-T0"), PER_ACTION), (spec_of_task("bus14-H0"), VALUE), (spec_of_task("bus14-R"), PER_ACTION)],
+)
+def test_steps_down_a_gradient_are_those_of_pytorchs_plain_optimiser(
+    network: str, spec: Spec, output: Output, device: str
+):
+    """Its gradients are those of ``backward``; Adam magnifies the roundings of small ones."""
+    if device == "cuda" and not torch.cuda.is_available():
+        pytest.skip("needs a graphics card")
+    inputs = observations(spec, 16)
+    ours, theirs = (factory(spec, network).make(output, (32, 32), orthogonal(1.0)) for _ in range(2))
+    ours = ours.to(device)
+    before = torch.cat([weight.detach().flatten() for weight in theirs.parameters()])
+    optimizer = Adam(ours.parameters(), lr=1e-3, eps=1e-5)
+    reference = torch.optim.Adam(theirs.parameters(), lr=1e-3, eps=1e-5, fused=False, foreach=False)
+    for _ in range(5):
+        descend(optimizer, ours(inputs.to(device)).square().mean(), 10.0)
+        reference.zero_grad()
+        theirs(inputs).square().mean().backward()
+        nn.utils.clip_grad_norm_(theirs.parameters(), 10.0)
+        reference.step()
+    mine, other = (torch.cat([w.detach().cpu().flatten() for w in made.parameters()]) for made in (ours, theirs))
+    assert torch.linalg.vector_norm(mine - other) < 1e-3 * torch.linalg.vector_norm(other - before)
 
 
 @pytest.mark.parametrize("network", NETWORKS)
