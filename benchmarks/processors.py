@@ -1,9 +1,12 @@
-"""Whether trainings come out the same on other kinds of processors, as far as one machine can tell.
+"""Whether trainings come out the same on other kinds of processors.
 
 ``python benchmarks/processors.py`` trains every algorithm for some iterations, once as this machine does, and in
 processes whose compilers and libraries are told to choose code for other processors; it compares all weights of the
 policies, bit by bit, after every iteration, and writes ``benchmarks/results/processors.json``. It ends with status 1 if
 any differ. ``PYTHONPATH=OTHER/src`` asks for the sources of another checkout.
+
+``python benchmarks/processors.py --again``, on another machine, trains once, compares with the weights of the machine
+that wrote the results, and adds to them under ``elsewhere`` which trainings differ; status 1 likewise.
 """
 
 from __future__ import annotations
@@ -32,17 +35,16 @@ _NO_AVX512 = "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX51
 PROCESSORS: dict[str, dict[str, str]] = {
     "this one": {},
     "AVX-512 in PyTorch": {"ATEN_CPU_CAPABILITY": "avx512"},
-    "products of MKL for any processor": {"MKL_CBWR": "COMPATIBLE", "ONEDNN_MAX_CPU_ISA": "SSE41"},
+    "oneDNN for any processor": {"ONEDNN_MAX_CPU_ISA": "SSE41"},
     "AVX2 throughout": {
         "NUMBA_CPU_NAME": "haswell",
         "NUMBA_CPU_FEATURES": "+avx,+avx2,+fma,+bmi,+bmi2,+lzcnt,+popcnt,+f16c,+movbe,+sse4.1,+sse4.2",
-        "MKL_CBWR": "COMPATIBLE",
         "ONEDNN_MAX_CPU_ISA": "SSE41",
         "NPY_DISABLE_CPU_FEATURES": _NO_AVX512,
         "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-AVX2_Usable,-FMA,-FMA_Usable,-FMA4",
     },
 }
-"""What is chosen, by environment variables of Numba, PyTorch, MKL, oneDNN, NumPy and the C library."""
+"""What is chosen, by environment variables of Numba, PyTorch, oneDNN, NumPy and the C library."""
 
 
 def train() -> None:
@@ -81,15 +83,31 @@ def trained(variables: dict[str, str]) -> dict[str, list[str]]:
     return dict(json.loads(line) for line in output.splitlines())
 
 
+def again(results: Path) -> int:
+    """Compare with the machine that wrote the results, and add what came out."""
+    from rl2grid.records.files import write_json
+    from rl2grid.records.versions import library_versions, processor
+
+    written = json.loads(results.read_text())
+    differing = [run for run, hashes in trained({}).items() if hashes != written["hashes"][run]]
+    print(f"{processor()}: {', '.join(differing) or 'none'} differ from {written['processor']}")
+    written["elsewhere"][processor()] = {"versions": library_versions(), "differing": differing}
+    write_json(results, written, indent=1)
+    return int(bool(differing))
+
+
 def main() -> int:
     """Compare them, and write what came out."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--train", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--again", action="store_true", help="compare with the machine of the results")
     parser.add_argument("--results", type=Path, default=RESULTS)
     arguments = parser.parse_args()
     if arguments.train:
         train()
         return 0
+    if arguments.again:
+        return again(arguments.results)
     from rl2grid.records.files import write_json
     from rl2grid.records.versions import library_versions, processor
 
@@ -106,6 +124,7 @@ def main() -> int:
         "hashes": found["this one"],
         "variables": PROCESSORS,
         "differing": differing,
+        "elsewhere": {},
     }
     write_json(arguments.results, result, indent=1)
     return int(any(differing.values()))
