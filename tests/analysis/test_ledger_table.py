@@ -76,6 +76,12 @@ def test_configurations_of_one_label_and_budget_are_told_apart_by_their_hyperpar
     assert "| ppo + idle (layers 8) |" in short_ledger_table(results, TASK).replace("**", "")
 
 
+def test_another_network_than_an_mlp_is_named():
+    others = [trained(1, [0.6, 0.8], hyperparameters={"seed": 1, "network": name}) for name in ("mlp", "gnn")]
+    assert [one.label for one in others] == ["ppo + idle", "ppo, gnn + idle"]
+    assert trained(1, [0.6, 0.8]).label == "ppo + idle"
+
+
 def test_what_later_rules_of_an_agent_replaced_is_marked_and_left_out_of_short_tables():
     results = ledger(
         untrained("do-nothing", [0.1, 0.2]), untrained("planner", [0.7, 0.8]), untrained("planner", [0.6, 0.8], rules=2)

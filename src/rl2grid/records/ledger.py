@@ -86,11 +86,13 @@ class HashedTest:
 
     @property
     def player(self) -> str:
-        """The agent, what it observes beside the paper's features, and of how many actions the what-if chose."""
+        """The agent, its network if no ``mlp``, features beside the paper's, of how many actions the what-if chose."""
+        network = self.configuration.get("hyperparameters", {}).get("network", "mlp")
         features = self.configuration.get("env_keywords", {}).get("operator_features")
         top_k = self.configuration.get("top_k")
         observing = "" if features is None else f", observing {features}"
-        return f"{self.agent}{observing}" + ("" if top_k is None else f", best of {top_k}")
+        with_network = "" if network == "mlp" else f", {network}"
+        return f"{self.agent}{with_network}{observing}" + ("" if top_k is None else f", best of {top_k}")
 
     @property
     def label(self) -> str:
