@@ -14,6 +14,14 @@ os.environ[MAKERS] = "0"  # tests need few years of training, and all cores
 
 
 @pytest.fixture(scope="session", autouse=True)
+def stable_baselines3_logs_where_pytest_cleans_up(tmp_path_factory: pytest.TempPathFactory):
+    """Rather than in a new folder of the system's temporary files for every model."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SB3_LOGDIR", str(tmp_path_factory.mktemp("stable-baselines3")))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
 def grid2op_environments_are_made_once():
     """Reference engines of this process copy the first Grid2Op environment of their kind."""
     with pytest.MonkeyPatch.context() as patch:
