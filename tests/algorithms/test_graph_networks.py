@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from test_descent import pytorchs_step
+from torch import Tensor
 
 from rl2grid.algorithms.descent import Adam, descend
 from rl2grid.algorithms.networks import (
@@ -32,6 +33,7 @@ from rl2grid.errors import UsageError
 from rl2grid.mdp.actions import ActionKind, level_catalogue, moved_elements
 
 NETWORKS = ("gnn", "action-embedding")
+needs_a_card = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a graphics card")
 
 
 @functools.cache
@@ -66,7 +68,7 @@ def observations(spec: Spec, n: int, *, split: float = 0.1, seed: int = 0) -> Te
 # --- What every network must do -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("device", ["cpu", "cuda"])
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=needs_a_card)])
 @pytest.mark.parametrize("network", ["mlp", *NETWORKS])
 @pytest.mark.parametrize(
     ("spec", "output"),
@@ -76,8 +78,6 @@ def test_steps_down_a_gradient_are_those_of_pytorchs_plain_optimiser(
     network: str, spec: Spec, output: Output, device: str
 ):
     """Its gradients are those of ``backward``; Adam magnifies the roundings of small ones."""
-    if device == "cuda" and not torch.cuda.is_available():
-        pytest.skip("needs a graphics card")
     inputs = observations(spec, 16)
     ours, theirs = (factory(spec, network).make(output, (32, 32), orthogonal(1.0)) for _ in range(2))
     ours = ours.to(device)
@@ -86,10 +86,7 @@ def test_steps_down_a_gradient_are_those_of_pytorchs_plain_optimiser(
     reference = torch.optim.Adam(theirs.parameters(), lr=1e-3, eps=1e-5, fused=False, foreach=False)
     for _ in range(5):
         descend(optimizer, ours(inputs.to(device)).square().mean(), 10.0)
-        reference.zero_grad()
-        theirs(inputs).square().mean().backward()
-        nn.utils.clip_grad_norm_(theirs.parameters(), 10.0)
-        reference.step()
+        pytorchs_step(reference, theirs(inputs).square().mean(), 10.0)
     mine, other = (torch.cat([w.detach().cpu().flatten() for w in made.parameters()]) for made in (ours, theirs))
     assert torch.linalg.vector_norm(mine - other) < 1e-3 * torch.linalg.vector_norm(other - before)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -139,30 +139,14 @@ def descend(optimizer: torch.optim.Optimizer, loss: Tensor, max_norm: float) -> 
     """
     groups: list[list[Tensor]] = [group["params"] for group in optimizer.param_groups]
     weights = [weight for group in groups for weight in group]
-    gradients = torch.autograd.grad(loss, weights, allow_unused=True)
-    for weight, gradient in zip(weights, _apart(weights, gradients), strict=True):
-        weight.grad = gradient
+    for weight in weights:
+        weight.grad = None
+    # Not ``autograd.grad``: its gradients may lie in memory otherwise than their weights, or be one for several,
+    # which neither the fused step nor what scales them in place can take.
+    torch.autograd.backward(loss, inputs=weights)
     for group in groups:
         shorten([weight.grad for weight in group if weight.grad is not None], max_norm)
     optimizer.step()
-
-
-def _apart(weights: list[Tensor], gradients: Iterable[Tensor | None]) -> Iterator[Tensor | None]:
-    """The gradients, of which none has its numbers in common with another, and each has them as its weight has its own.
-
-    ``backward`` sees to both, ``autograd.grad`` to neither: weights that are added share one gradient, which would be
-    scaled down twice, and parts of a joined matrix have the gaps of the whole. PyTorch's fused Adam takes for granted
-    that there are none: on a processor it takes whatever numbers lie there, on a card it refuses.
-    """
-    taken: set[int] = set()
-    for weight, gradient in zip(weights, gradients, strict=True):
-        if gradient is None:
-            yield None
-            continue
-        place = gradient.data_ptr()
-        own = place not in taken and gradient.stride() == weight.stride()
-        taken.add(place)
-        yield gradient if own else torch.empty_like(weight).copy_(gradient)
 
 
 def shorten(gradients: list[Tensor], max_norm: float) -> None:
