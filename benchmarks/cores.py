@@ -18,12 +18,11 @@ import time
 from pathlib import Path
 from typing import Any
 
-from rl2grid.algorithms.registry import find_algorithm
+from loop_speed import measure
+
 from rl2grid.envs.tasks import find_task
 from rl2grid.records.files import write_json
 from rl2grid.records.versions import library_versions, processor
-from rl2grid.training.request import RunArgs, hyperparameters
-from rl2grid.training.runs import make_envs
 
 RESULTS = Path(__file__).resolve().parent / "results" / "cores.json"
 TASKS = ("bus14-T0",)
@@ -32,17 +31,8 @@ NUM_ENVS = 256
 
 def trains(task: str, threads: int, seconds: float) -> float:
     """Decisions per second of one training."""
-    chosen = hyperparameters("ppo", task, total_timesteps=100_000_000, num_envs=NUM_ENVS)
-    args = RunArgs(find_task(task), chosen, "ppo", num_threads=threads, env_keywords={"heuristic": "idle"})
-    envs = make_envs(args)
-    trainer: Any = find_algorithm("ppo").trainer(chosen, envs)
-    for _ in range(2):
-        trainer.iterate()
-    began, before = time.perf_counter(), trainer.decisions
-    while (took := time.perf_counter() - began) < seconds:
-        trainer.iterate()
-    envs.close()
-    return (trainer.decisions - before) / took
+    rates = measure("ppo", task, "idle", NUM_ENVS, num_threads=threads, seconds=seconds, clock=time.perf_counter)
+    return rates["decisions_per_s"]
 
 
 def side_by_side(task: str, trainings: int, seconds: float) -> float:
@@ -75,8 +65,8 @@ def main() -> int:
             "trainings of ppo side by side": lambda n, task=task: side_by_side(task, n, options.seconds),
         }
         rows = result["tasks"][task] = {}
-        for name, measure in measures.items():
-            rates = {n: measure(n) for n in options.cores}
+        for name, of_cores in measures.items():
+            rates = {n: of_cores(n) for n in options.cores}
             one = rates[options.cores[0]]
             rows[name] = {
                 str(n): {"per_second": round(rate), "ratio": round(rate / one, 2)} for n, rate in rates.items()

@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from gymnasium.vector import VectorWrapper
+from loop_speed import Timed
 
 from rl2grid.algorithms.devices import find_device
 from rl2grid.algorithms.registry import find_algorithm
@@ -72,22 +72,6 @@ CASES = (
 )
 
 
-class Timed(VectorWrapper[Any, Any, Any, Any, Any]):
-    """Environments whose steps are timed."""
-
-    seconds = 0.0
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.env, name)
-
-    def step(self, actions: Any) -> Any:
-        """A step of all of them."""
-        began = time.perf_counter()
-        shown = super().step(actions)
-        self.seconds += time.perf_counter() - began
-        return shown
-
-
 class Training:
     """A case on a device."""
 
@@ -101,7 +85,7 @@ class Training:
         args = RunArgs(
             find_task(case.task), chosen, case.algorithm, num_threads=num_threads, env_keywords={"heuristic": heuristic}
         )
-        self.envs = Timed(make_envs(args))
+        self.envs = Timed(make_envs(args), time.perf_counter)
         self.trainer: Any = find_algorithm(case.algorithm).trainer(chosen, self.envs)
         self._threads = torch_threads
 
@@ -140,9 +124,8 @@ def measured(case: Case, options: argparse.Namespace) -> dict[str, Any]:
     trainings = {name: Training(case, *where, options.threads) for name, where in devices.items()}
     again = Training(case, "cuda", 1, options.threads)
     start = trainings["cpu"].weights()
-    for training in trainings.values():
+    for training in (*trainings.values(), again):
         until_updated(training)
-    until_updated(again)
     moved = distance(start, trainings["cpu"].weights())
     row: dict[str, Any] = {
         "rounds": options.rounds,

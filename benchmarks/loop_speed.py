@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -46,17 +47,17 @@ LOOPS: tuple[tuple[str, str, str | None, int], ...] = (
 
 
 class Timed(VectorWrapper[Any, Any, Any, Any, Any]):
-    """Environments that note the processor time that they take."""
+    """Environments that note the time that their steps take, by a clock."""
 
-    def __init__(self, envs: VectorEnv[Any, Any, Any]) -> None:
+    def __init__(self, envs: VectorEnv[Any, Any, Any], clock: Callable[[], float]) -> None:
         super().__init__(envs)
-        self.seconds = 0.0
+        self.seconds, self._clock = 0.0, clock
 
     def step(self, actions: Any) -> Any:
         """As of the environments."""
-        began = time.process_time()
+        began = self._clock()
         result = self.env.step(actions)
-        self.seconds += time.process_time() - began
+        self.seconds += self._clock() - began
         return result
 
     def action_masks(self) -> Any:
@@ -65,18 +66,24 @@ class Timed(VectorWrapper[Any, Any, Any, Any, Any]):
 
 
 def measure(
-    algorithm: str, task: str, heuristic: str | None, num_envs: int, *, num_threads: int, seconds: float
+    algorithm: str,
+    task: str,
+    heuristic: str | None,
+    num_envs: int,
+    *,
+    num_threads: int,
+    seconds: float,
+    clock: Callable[[], float],
 ) -> dict[str, float]:
-    """Rates of one loop: of a second of processor time with one thread, of a second with more."""
+    """Rates of one loop per second of the clock, and with one thread the share of the environments."""
     chosen = hyperparameters(algorithm, task, total_timesteps=100_000_000, num_envs=num_envs, **_small(algorithm))
     arguments = RunArgs(task, chosen, algorithm, env_keywords={"heuristic": heuristic}, num_threads=num_threads)
-    envs: Any = Timed(make_envs(arguments))
+    envs: Any = Timed(make_envs(arguments), clock)
     trainer = find_algorithm(algorithm).trainer(chosen, envs)
     trainer.iterate()
     # The off-policy algorithms play before they learn.
     while trainer.decisions <= getattr(chosen, "learning_starts", 0):
         trainer.iterate()
-    clock = time.process_time if num_threads == 1 else time.perf_counter
     began, decisions, grid_steps, envs.seconds = clock(), trainer.decisions, trainer.grid_steps, 0.0
     while clock() - began < seconds:
         trainer.iterate()
@@ -107,8 +114,10 @@ def main() -> None:
         if options.only is not None and not name.startswith(tuple(options.only)):
             continue
         results[name] = {"seconds": options.seconds} | {
-            words: measure(algorithm, task, heuristic, num_envs, num_threads=count, seconds=options.seconds)
-            for words, count in (("one thread", 1), ("two threads", 2))
+            words: measure(
+                algorithm, task, heuristic, num_envs, num_threads=count, seconds=options.seconds, clock=clock
+            )
+            for words, count, clock in (("one thread", 1, time.process_time), ("two threads", 2, time.perf_counter))
         }
         print(name, results[name], flush=True)
         write_json(RESULTS, results, indent=1)

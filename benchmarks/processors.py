@@ -20,6 +20,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from rl2grid.records.files import write_json
+from rl2grid.records.versions import library_versions, processor
+
 RESULTS = Path(__file__).resolve().parent / "results" / "processors.json"
 ITERATIONS = 4
 TRAININGS: tuple[tuple[str, str], ...] = (
@@ -85,9 +88,6 @@ def trained(variables: dict[str, str]) -> dict[str, list[str]]:
 
 def again(results: Path) -> int:
     """Compare with the machine that wrote the results, and add what came out."""
-    from rl2grid.records.files import write_json
-    from rl2grid.records.versions import library_versions, processor
-
     written = json.loads(results.read_text())
     differing = [run for run, hashes in trained({}).items() if hashes != written["hashes"][run]]
     print(f"{processor()}: {', '.join(differing) or 'none'} differ from {written['processor']}")
@@ -108,9 +108,6 @@ def main() -> int:
         return 0
     if arguments.again:
         return again(arguments.results)
-    from rl2grid.records.files import write_json
-    from rl2grid.records.versions import library_versions, processor
-
     found: dict[str, dict[str, list[str]]] = {}
     differing: dict[str, list[str]] = {}
     for name, variables in PROCESSORS.items():
