@@ -1,7 +1,8 @@
 """Results on the pages, made from the ledger while the site is built: a figure and a short table of each task.
 
 Pages name the tasks, with ``<!-- results: bus14-T0 -->``, or with ``<!-- figure: bus14-T0 -->`` for the figure alone;
-``<!-- overview -->`` is the table of all tasks, ``<!-- learned -->`` that of methods trained with several seeds.
+``<!-- overview -->`` is the table of all tasks, ``<!-- learned -->`` that of methods trained with several seeds,
+``<!-- bounds -->`` what those survive who know what comes, beside who does not.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from mkdocs.structure.files import Files
 from mkdocs.structure.pages import Page
 from pictures import add_picture, picture_markdown
 
+from rl2grid.analysis.ledger_bounds import headroom_table
 from rl2grid.analysis.ledger_figure import draw_ledger
 from rl2grid.analysis.ledger_learned import learned_table
 from rl2grid.analysis.ledger_overview import overview_table
@@ -23,9 +25,14 @@ from rl2grid.analysis.ledger_table import short_ledger_table
 from rl2grid.envs.tasks import find_task
 from rl2grid.records.ledger import HashedTest, read_ledger
 
-LEDGER = Path(__file__).resolve().parents[2] / "benchmarks" / "results" / "baselines.json"
+RESULTS = Path(__file__).resolve().parents[2] / "benchmarks" / "results"
+LEDGER, BOUNDS = RESULTS / "baselines.json", RESULTS / "bounds.json"
 PAGES = ("results.md", "index.md")
-_TABLES = {"<!-- overview -->": overview_table, "<!-- learned -->": learned_table}
+_TABLES = {
+    "<!-- overview -->": overview_table,
+    "<!-- learned -->": learned_table,
+    "<!-- bounds -->": lambda results: headroom_table(results, read_ledger(BOUNDS)),
+}
 _MARK = re.compile(r"<!-- (results|figure): (\S+) -->")
 
 

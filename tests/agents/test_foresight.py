@@ -10,7 +10,7 @@ import pytest
 
 import rl2grid  # noqa: F401 - registers the tasks
 from rl2grid.agents.do_nothing import DoNothing
-from rl2grid.agents.foresight import Foresight
+from rl2grid.agents.foresight import Foresight, _Telling
 from rl2grid.agents.planner import Planner
 from rl2grid.envs.tasks import find_task
 from rl2grid.errors import UsageError
@@ -71,7 +71,7 @@ def test_in_a_joint_task_another_topology_action_keeps_the_injection_of_the_guid
     agent = Foresight(Shifting(), ahead=12, candidates=3, attempts=5)
     env, observation, info = begun(agent, "bus14-H0")
     agent.act(observation, info)
-    tried = [attempt.action for attempt in agent._attempts_at(list(agent._course))]
+    tried = [attempt.action for attempt in agent._courses.attempts_at(list(agent._course))]
     assert tried
     for action in tried:
         assert env.action_space.contains(action)
@@ -95,11 +95,11 @@ def test_where_power_is_dispatched_the_planner_is_told_what_comes(task, first_is
     _, observation, info = begun(agent, task)
     agent.act(observation, info)
     decisions = list(agent._course)
-    attempts = list(agent._attempts_at(decisions))
-    assert (attempts[0].foretold is not None) is first_is_told
-    told = [attempt.foretold for attempt in attempts if attempt.foretold is not None]
+    attempts = list(agent._courses.attempts_at(decisions))
+    assert isinstance(attempts[0], _Telling) is first_is_told
+    told = [attempt.foretold for attempt in attempts if isinstance(attempt, _Telling)]
     assert all(each.step == decisions[-1].step for each in told)
-    assert all(attempt.foretold is not None for attempt in attempts) is (task == "bus14-R")
+    assert all(isinstance(attempt, _Telling) for attempt in attempts) is (task == "bus14-R")
 
 
 def test_redispatching_it_outlives_nobody_by_less():

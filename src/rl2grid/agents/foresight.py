@@ -2,62 +2,32 @@
 
 from __future__ import annotations
 
-import copy
-import itertools
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from numbers import Integral
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium
 import numpy as np
 
-from rl2grid.agents.agent import Action, Agent, Considered, Info, Observation, topology_part
+from rl2grid.agents.agent import Action, Agent, Considered, Info, Observation
+from rl2grid.agents.courses import EARLIER, Attempt, Averted, Course, Courses, Decision, begin_of_crisis
 from rl2grid.agents.planner import Foretold, Planner
 from rl2grid.agents.trend import undispatched
 from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.engines.worlds import World
 from rl2grid.errors import UsageError
-from rl2grid.handles import AsOpened
-from rl2grid.mdp.actions import TOPOLOGY
-from rl2grid.mdp.heuristics import is_safe
-from rl2grid.mdp.state import GridState
 
-_EARLIER = (1, 3, 6, 12, 24, 48)
-"""Decisions before the grid became unsafe at which something else is tried as well."""
 _AHEAD, _CANDIDATES, _ATTEMPTS = 96, 24, 300
 """Decisions played in advance, actions tried per decision and attempts per death, unless others are asked for."""
-_PAST = 24
-"""Grid steps after the moment of a death that an attempt must survive to have averted it."""
 
 
-class _Decision(NamedTuple):
-    """A decision in the episode that is to come."""
+@dataclass(frozen=True, kw_only=True)
+class _Telling(Attempt):
+    """The guide is told something, from the last decision on."""
 
-    world: World  # before it
-    step: int
-    safe: bool
-    action: Action
-
-
-class _Course(NamedTuple):
-    """What follows from a moment."""
-
-    decisions: list[_Decision]
-    end: World | None  # after the last decision; None: the episode is over
-    lost: bool
-    step: int
-    """The last grid step that was survived."""
-
-
-class _Attempt(NamedTuple):
-    """Decisions up to one at which something else is tried."""
-
-    decisions: Sequence[_Decision]
-    action: Action | None = None
-    """What is played there; None: what the guide chooses."""
-    foretold: Foretold | None = None
-    """What the guide is told from there on."""
+    foretold: Foretold
 
 
 class Foresight:
@@ -120,14 +90,12 @@ class Foresight:
         if not isinstance(base.engine, NativeEngine):
             raise UsageError(f'Agent {self.name!r} asks what-ifs of the native engine: choose engine="native".')
         self._present = base
-        self._future: Any = copy.deepcopy(base)
-        self._opened: AsOpened[GridState] = AsOpened()
-        self._guide.bind(self._future)
+        self._courses = _Told(base, self._guide, self._candidates, self._ahead)
 
     def reset(self, i: int) -> None:
         """Forget what was foreseen."""
-        self._guide.reset(0)
-        self._course: deque[_Decision] = deque()
+        self._courses.reset()
+        self._course: deque[Decision] = deque()
         self._end: World | None = None
         self._ends = False  # the end of the episode is in the course, good or bad
         self._why = ""
@@ -153,117 +121,58 @@ class Foresight:
     def _go_on(self) -> None:
         """Extend the course, by what averts a death where there is one."""
         assert self._end is not None
-        course = self._play(self._end, None, self._ahead - len(self._course))
+        course = self._courses.play(self._end, None, self._ahead - len(self._course))
         decisions = [*self._course, *course.decisions]
         if course.lost:
-            course = self._averted(course._replace(decisions=decisions))
+            averted = self._courses.averted(course._replace(decisions=decisions), self._attempts)
+            self._why = _reason(course.step, averted)
+            course = averted.course
             decisions = course.decisions
         self._course, self._end, self._ends = deque(decisions), course.end, course.end is None
 
-    def _averted(self, course: _Course) -> _Course:
-        """A course that outlives the end of the given one by far enough; if none is found, the one that lives longest.
 
-        What delays a death without averting it is where the next attempts begin.
-        """
-        death, left = course.step, self._attempts
-        while left > 0:
-            until, longest = course.step + _PAST, course
-            for attempt in itertools.islice(self._attempts_at(course.decisions), left):
-                left -= 1
-                *before, last = attempt.decisions
-                played = self._tried(attempt, last.world, until)
-                played = played._replace(decisions=[*before, *played.decisions])
-                if not played.lost:
-                    what = "another action in" if attempt.foretold is None else "another dispatch from"
-                    self._why = f"the game over of step {death} is averted by {what} step {last.step}"
-                    return played
-                if played.step > longest.step:
-                    longest = played
-            if longest is course:
-                break
-            course = longest
-        self._why = f"nothing was found that averts the game over of step {course.step}"
-        return course
+class _Told(Courses):
+    """Where power can be dispatched, the planner is told what comes before anything else is tried."""
 
-    def _tried(self, attempt: _Attempt, world: World, until: int) -> _Course:
-        if attempt.foretold is None:
-            return self._play(world, attempt.action, None, until)
+    def __init__(self, env: Any, guide: Agent, candidates: int, ahead: int) -> None:
+        super().__init__(env, guide, candidates)
+        self._task, self._ahead = env.task, ahead
+
+    def attempts_at(self, decisions: Sequence[Decision]) -> Iterator[Attempt]:
+        if isinstance(self._guide, Planner) and self._task.injects:
+            crisis, foretold = begin_of_crisis(decisions), self._foretold(decisions[-1].world)
+            for earlier in (0, *EARLIER, self._ahead):
+                at = max(crisis - earlier, 0)
+                yield _Telling(decisions[: at + 1], foretold=self._lost_from(decisions[at].world, foretold))
+                if at == 0:
+                    break
+        if self._task.changes_topology:
+            yield from super().attempts_at(decisions)
+
+    def tried(self, attempt: Attempt, world: World, until: int) -> Course:
+        if not isinstance(attempt, _Telling):
+            return super().tried(attempt, world, until)
         assert isinstance(self._guide, Planner)
         self._guide.forewarn(attempt.foretold)
-        played = self._play(world, None, None, until)
+        played = self.play(world, None, None, until)
         self._guide.forewarn(None)
         return played
 
-    def _attempts_at(self, decisions: Sequence[_Decision]) -> Iterator[_Attempt]:
-        """What is tried: first to tell the guide what comes, then other topology actions, the last decisions first."""
-        crisis = len(decisions) - 1
-        while crisis > 0 and not decisions[crisis - 1].safe:
-            crisis -= 1
-        if isinstance(self._guide, Planner) and self._present.task.injects:
-            foretold = self._foretold(decisions[-1].world)
-            for earlier in (0, *_EARLIER, self._ahead):
-                at = max(crisis - earlier, 0)
-                yield _Attempt(decisions[: at + 1], foretold=self._lost_from(decisions[at].world, foretold))
-                if at == 0:
-                    break
-        if self._present.task.changes_topology:
-            yield from self._topology_attempts(decisions, crisis)
-
     def _foretold(self, world: World) -> Foretold:
         """The last moment before a death, and all lines that are out then."""
-        self._future.restore(world)
-        state = self._future.state
+        self._env.restore(world)
+        state = self._env.state
         lines = np.flatnonzero(~state.line_status[0]).astype(np.int32)
-        return Foretold(int(state.step[0]), lines, undispatched(state, self._future.grid))
+        return Foretold(int(state.step[0]), lines, undispatched(state, self._env.grid))
 
     def _lost_from(self, world: World, foretold: Foretold) -> Foretold:
         """The same, of the lines that are in service in a world."""
-        self._future.restore(world)
-        return foretold._replace(lines=foretold.lines[self._future.state.line_status[0][foretold.lines]])
-
-    def _topology_attempts(self, decisions: Sequence[_Decision], crisis: int) -> Iterator[_Attempt]:
-        remedies = self._best_at(decisions[crisis].world)
-        for at in range(len(decisions) - 1, crisis - 1, -1):
-            yield from self._others(decisions[: at + 1], self._best_at(decisions[at].world))
-        for at in (crisis - earlier for earlier in _EARLIER if earlier <= crisis):
-            yield from self._others(decisions[: at + 1], remedies)
-
-    def _others(self, decisions: Sequence[_Decision], topologies: Iterable[int]) -> Iterator[_Attempt]:
-        """The last decision with other topology actions; what it injects in a joint task stays."""
-        played = decisions[-1].action
-        others = (topology for topology in topologies if topology != topology_part(played))
-        return (_Attempt(decisions, _with_topology(played, topology)) for topology in others)
-
-    def _best_at(self, world: World) -> list[int]:
-        """Nothing, and the topology actions with the least worst loading in the next step."""
-        self._future.restore(world)
-        outcomes = self._future.what_if()
-        loading = np.where(outcomes.legal, outcomes.worst_loading, np.inf)
-        best = np.argsort(loading, kind="stable")[: self._candidates]
-        return [int(action) for action in dict.fromkeys([*best[np.isfinite(loading[best])].tolist(), 0])]
-
-    def _play(self, world: World, first: Action | None, most: int | None, until: int | None = None) -> _Course:
-        """Let the guide play on, after an action of one's own.
-
-        Args:
-            world: where it begins.
-            first: the action that is played first; None: the guide's.
-            most: decisions at most.
-            until: the grid step at which it ends.
-        """
-        future = self._future
-        observation, info = future.restore(world)
-        state, decisions, over = future.state, list[_Decision](), False
-        lost = False
-        while not over and (most is None or len(decisions) < most) and (until is None or int(state.step[0]) < until):
-            before = future.save() if decisions else world
-            step, safe = int(state.step[0]), is_safe(self._opened(state), 0)
-            action = first if first is not None and not decisions else self._guide.act(observation, info)
-            observation, _, lost, completed, info = future.step(action)
-            decisions.append(_Decision(before, step, safe, action))
-            over = lost or completed
-        return _Course(decisions, None if over else future.save(), bool(lost), int(info["step"]))
+        self._env.restore(world)
+        return foretold._replace(lines=foretold.lines[self._env.state.line_status[0][foretold.lines]])
 
 
-def _with_topology(action: Action, topology: int) -> Action:
-    return {**action, TOPOLOGY: topology} if isinstance(action, Mapping) else topology
+def _reason(death: int, averted: Averted) -> str:
+    if averted.attempt is None:
+        return f"nothing was found that averts the game over of step {averted.course.step}"
+    what = "another dispatch from" if isinstance(averted.attempt, _Telling) else "another action in"
+    return f"the game over of step {death} is averted by {what} step {averted.attempt.decisions[-1].step}"

@@ -15,6 +15,7 @@ from rl2grid.agents.milp import Milp
 from rl2grid.agents.planner import Planner
 from rl2grid.agents.random_agent import RandomAgent
 from rl2grid.agents.recovery import Recovery
+from rl2grid.agents.rehearsal import Rehearsal
 from rl2grid.algorithms.pretrained import is_pretrained
 from rl2grid.envs.tasks import Task
 from rl2grid.errors import UsageError, one_of
@@ -30,6 +31,7 @@ AGENTS: dict[str, Callable[[], Agent]] = {
     Milp.name: Milp,
     DcOpf.name: DcOpf,
     "planner": Planner,
+    Rehearsal.name: Rehearsal,
     Foresight.name: Foresight,
 }
 """Agents that need no training, by name."""

@@ -1,0 +1,178 @@
+"""Playing on from a saved world, and taking back what ends badly: for agents that look at more than one step."""
+
+from __future__ import annotations
+
+import copy
+import itertools
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rl2grid.agents.agent import Action, Agent, topology_part
+from rl2grid.engines.worlds import World
+from rl2grid.handles import AsOpened
+from rl2grid.mdp.actions import TOPOLOGY
+from rl2grid.mdp.heuristics import is_safe
+from rl2grid.mdp.state import GridState
+
+EARLIER = (1, 3, 6, 12, 24, 48)
+"""Decisions before the grid became unsafe at which something else is tried as well."""
+PAST = 24
+"""Grid steps after the moment of a death that an attempt must survive to have averted it."""
+
+
+class Decision(NamedTuple):
+    """A decision in a course."""
+
+    world: World  # before it
+    step: int
+    safe: bool
+    action: Action
+
+
+class Course(NamedTuple):
+    """What follows from a moment."""
+
+    decisions: list[Decision]
+    end: World | None  # after the last decision; None: the episode is over
+    lost: bool
+    step: int
+    """The last grid step that was survived."""
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """Decisions up to one at which something else is tried."""
+
+    decisions: Sequence[Decision]
+    action: Action | None = None
+    """What is played there; None: what the guide chooses."""
+
+
+class Averted(NamedTuple):
+    """What was found against a death."""
+
+    course: Course
+    attempts: int
+    """That were made."""
+    attempt: Attempt | None = None
+    """The one that averted it; None: none did."""
+
+
+class Courses:
+    """What comes of decisions in a copy of an environment, where a guide plays on.
+
+    Args:
+        env: the environment that is copied.
+        guide: who plays on, from any state and whatever was played before; it is bound to the copy.
+        candidates: other actions that are tried per decision: the best ones by the worst loading in the next step.
+    """
+
+    def __init__(self, env: Any, guide: Agent, candidates: int) -> None:
+        self._guide, self._candidates = guide, candidates
+        self._env: Any = copy.deepcopy(env)
+        self._opened: AsOpened[GridState] = AsOpened()
+        guide.bind(self._env)
+
+    def reset(self) -> None:
+        """A new episode begins."""
+        self._guide.reset(0)
+
+    def play(self, world: World, first: Action | None, most: int | None, until: int | None = None) -> Course:
+        """Let the guide play on, after an action of one's own.
+
+        Args:
+            world: where it begins.
+            first: the action that is played first; None: the guide's.
+            most: decisions at most.
+            until: the grid step at which it ends.
+        """
+        return self._course(world, () if first is None else (first,), most, until)
+
+    def follow(self, world: World, actions: Sequence[Action], until: int) -> Course:
+        """Play actions, one after the other, and let the guide play on from there, until a grid step."""
+        return self._course(world, actions, None, until)
+
+    def averted(self, course: Course, attempts: int) -> Averted:
+        """A course that outlives the end of the given one by far enough; if none is found, the one that lives longest.
+
+        What delays a death without averting it is where the next attempts begin.
+
+        Args:
+            course: one that ends with a game over.
+            attempts: that are made at most.
+        """
+        left = attempts
+        while left > 0:
+            until, longest = course.step + PAST, course
+            for attempt in itertools.islice(self.attempts_at(course.decisions), left):
+                left -= 1
+                *before, last = attempt.decisions
+                played = self.tried(attempt, last.world, until)
+                played = played._replace(decisions=[*before, *played.decisions])
+                if not played.lost:
+                    return Averted(played, attempts - left, attempt)
+                if played.step > longest.step:
+                    longest = played
+            if longest is course:
+                break
+            course = longest
+        return Averted(course, attempts - left)
+
+    def tried(self, attempt: Attempt, world: World, until: int) -> Course:
+        """What comes of an attempt, until a grid step."""
+        return self.play(world, attempt.action, None, until)
+
+    def attempts_at(self, decisions: Sequence[Decision]) -> Iterator[Attempt]:
+        """What is tried: other topology actions, the last decisions first."""
+        crisis = begin_of_crisis(decisions)
+        remedies = self._best_at(decisions[crisis].world)
+        for at in range(len(decisions) - 1, crisis - 1, -1):
+            yield from _others(decisions[: at + 1], self._best_at(decisions[at].world))
+        for at in (crisis - earlier for earlier in EARLIER if earlier <= crisis):
+            yield from _others(decisions[: at + 1], remedies)
+
+    def _best_at(self, world: World) -> list[int]:
+        """Nothing, and the topology actions with the least worst loading in the next step."""
+        self._env.restore(world)
+        outcomes = self._env.what_if()
+        loading = np.where(outcomes.legal, outcomes.worst_loading, np.inf)
+        best = np.argsort(loading, kind="stable")[: self._candidates]
+        return [int(action) for action in dict.fromkeys([*best[np.isfinite(loading[best])].tolist(), 0])]
+
+    def _course(self, world: World, first: Sequence[Action], most: int | None, until: int | None) -> Course:
+        """Actions of one's own, then the guide's."""
+        env = self._env
+        observation, info = env.restore(world)
+        state, decisions, over = env.state, list[Decision](), False
+        lost = False
+        while not over and (most is None or len(decisions) < most) and (until is None or int(state.step[0]) < until):
+            before = env.save() if decisions else world
+            step, safe = int(state.step[0]), is_safe(self._opened(state), 0)
+            played = len(decisions)
+            action = first[played] if played < len(first) else self._guide.act(observation, info)
+            observation, _, lost, completed, info = env.step(action)
+            decisions.append(Decision(before, step, safe, action))
+            over = lost or completed
+        return Course(decisions, None if over else env.save(), bool(lost), int(info["step"]))
+
+
+def begin_of_crisis(decisions: Sequence[Decision]) -> int:
+    """Which is the first of the last decisions, none of which was taken in a safe grid; at most the last."""
+    crisis = len(decisions) - 1
+    while crisis > 0 and not decisions[crisis - 1].safe:
+        crisis -= 1
+    return crisis
+
+
+def _others(decisions: Sequence[Decision], topologies: Iterable[int]) -> Iterator[Attempt]:
+    """The last decision with other topology actions; what it injects in a joint task stays."""
+    played = decisions[-1].action
+    others = (topology for topology in topologies if topology != topology_part(played))
+    return (Attempt(decisions, _with_topology(played, topology)) for topology in others)
+
+
+def _with_topology(action: Action, topology: int) -> Action:
+    return {**action, TOPOLOGY: topology} if isinstance(action, Mapping) else topology

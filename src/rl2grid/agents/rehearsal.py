@@ -1,0 +1,162 @@
+"""Crises rehearsed before they are played, in worlds that an operator imagines (``docs/algorithms/rehearsal.md``)."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from numbers import Integral
+from typing import Any
+
+import gymnasium
+
+from rl2grid.agents.agent import (
+    Action,
+    Agent,
+    Considered,
+    ExplainingAgent,
+    Info,
+    Observation,
+    OverruledAgent,
+    topology_part,
+)
+from rl2grid.agents.courses import Averted, Course, Courses
+from rl2grid.agents.planner import Planner
+from rl2grid.engines.native.engine import NativeEngine
+from rl2grid.errors import UsageError
+from rl2grid.handles import AsOpened
+from rl2grid.mdp.heuristics import is_safe
+from rl2grid.mdp.state import GridState
+
+_AHEAD, _CANDIDATES, _ATTEMPTS = 24, 24, 300
+"""Steps that must be survived, actions tried per decision and attempts per crisis, unless others are asked for."""
+_AT_ONCE = 60
+"""Attempts at one decision."""
+
+
+class Rehearsal:
+    """Plays what its guide, the planner, plays; in a crisis, only after it went well in an imagined world.
+
+    While the grid is safe, the guide decides. When it is not, what the guide would play is played on from an imagined
+    world of this moment: forecasts, announced maintenance, the attack under way, and what the guide would do then. If
+    the game is over there within two hours, other topology actions are tried, those shortly before that end first, and
+    the guide plays on from each; the first course that outlives that end by two hours is kept, else the one that lives
+    longest. What is kept is rehearsed anew at every decision, from the world as it has become, and played as long as it
+    goes well. So lines may trip on the way if what is left of the grid lives: no search for a safe state a few steps
+    ahead finds such courses. It knows what an operator knows, and nothing else.
+
+    In a joint task the guide injects, and topology actions are replaced.
+
+    Args:
+        guide: who plays while the grid is safe, and a copy of whom plays in rehearsals; None: the planner.
+        ahead: grid steps of a rehearsal.
+        candidates: other actions that are tried per decision: the best ones by the worst loading in the next step.
+        attempts: at courses that go well in one crisis, until the grid is safe again; sixty at most at one decision.
+
+    Raises:
+        UsageError: the guide is no agent, or one of the others no whole number of at least 1.
+    """
+
+    name = "rehearsal"
+    kinds = ("T", "H")
+
+    def __init__(
+        self,
+        guide: Agent | None = None,
+        ahead: int = _AHEAD,
+        candidates: int = _CANDIDATES,
+        attempts: int = _ATTEMPTS,
+    ) -> None:
+        asked = {"ahead": ahead, "candidates": candidates, "attempts": attempts}
+        for name, value in asked.items():
+            if not isinstance(value, Integral) or isinstance(value, bool) or value < 1:
+                raise UsageError(f"{name}={value!r} is not allowed: give a whole number, at least 1.")
+        if not (guide is None or isinstance(guide, Agent)):
+            raise UsageError(f"guide={guide!r} is not allowed: give an agent, such as Planner(), or None.")
+        self._guide: Agent = Planner() if guide is None else guide
+        self._understudy = copy.deepcopy(self._guide)
+        usual = {"ahead": _AHEAD, "candidates": _CANDIDATES, "attempts": _ATTEMPTS}
+        guided = [] if guide is None else [f"guided by {guide.name}"]
+        details = guided + [f"{name} {value}" for name, value in asked.items() if value != usual[name]]
+        self.name = f"rehearsal ({', '.join(details)})" if details else "rehearsal"
+        self._ahead, self._candidates, self._attempts = ahead, candidates, attempts
+
+    def bind(self, env: gymnasium.Env[Any, Any]) -> None:
+        """Make a copy of the environment, in which crises are rehearsed.
+
+        Raises:
+            UsageError: a redispatching task, which has no topology actions to try, or the reference engine, which
+                imagines nothing.
+        """
+        base: Any = env.unwrapped
+        if not base.task.changes_topology:
+            raise UsageError(
+                f"Agent {self.name!r} cannot play a redispatching task (-R-), which has no topology actions: "
+                "choose planner, or a task with topology."
+            )
+        if not isinstance(base.engine, NativeEngine):
+            raise UsageError(f'Agent {self.name!r} imagines worlds of the native engine: choose engine="native".')
+        self._env = base
+        self._kept: Sequence[Action] = []
+        self._opened: AsOpened[GridState] = AsOpened()
+        self._courses = Courses(base, self._understudy, self._candidates)
+        self._guide.bind(env)
+
+    def reset(self, i: int) -> None:
+        """A new episode: nothing is kept, and no attempt was made."""
+        self._guide.reset(0)
+        self._courses.reset()
+        self._calm()
+
+    def act(self, observation: Observation, info: Info) -> Action:
+        """The guide's action, or that of the course that went well."""
+        state: GridState = self._env.state
+        self._why = ""
+        proposed = self._guide.act(observation, info)
+        if is_safe(self._opened(state), 0):
+            self._calm()
+            return proposed
+        course = self._rehearsed(int(state.step[0]), proposed)
+        action = course.decisions[0].action
+        self._kept = [decision.action for decision in course.decisions[1:]]
+        if topology_part(action) != topology_part(proposed) and isinstance(self._guide, OverruledAgent):
+            self._guide.overruled(action)
+        return action
+
+    def overruled(self, played: Action) -> None:
+        """Another action than the rehearsed one was played: what was to follow it is of no use."""
+        self._kept = []
+        if isinstance(self._guide, OverruledAgent):
+            self._guide.overruled(played)
+
+    def explain(self) -> Considered | None:
+        """What the rehearsal said; while the grid is safe, why the guide plays what it plays."""
+        if self._why:
+            return Considered("", (), (), self._why)
+        return self._guide.explain() if isinstance(self._guide, ExplainingAgent) else None
+
+    def _calm(self) -> None:
+        self._kept = []
+        self._left, self._why = self._attempts, ""
+
+    def _rehearsed(self, step: int, proposed: Action) -> Course:
+        """The course that goes well, or lives longest."""
+        world, until = self._env.imagine(step), step + self._ahead
+        kept = self._courses.follow(world, self._kept, until) if self._kept else None
+        if kept is not None and not kept.lost:
+            self._why = "what was rehearsed before still goes well"
+            return kept
+        guided = self._courses.follow(world, [proposed], until)
+        if not guided.lost:
+            self._why = "what the guide plays goes well"
+            return guided
+        longest = guided if kept is None or guided.step >= kept.step else kept
+        averted = self._courses.averted(longest, min(self._left, _AT_ONCE))
+        self._left -= averted.attempts
+        self._why = _reason(longest.step, averted)
+        return averted.course
+
+
+def _reason(death: int, averted: Averted) -> str:
+    if averted.attempt is None:
+        return f"nothing was found that averts a game over after step {averted.course.step}, this lives longest"
+    return f"a game over after step {death} is averted by another action in step {averted.attempt.decisions[-1].step}"
