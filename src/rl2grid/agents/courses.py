@@ -5,13 +5,15 @@ from __future__ import annotations
 import copy
 import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from numbers import Integral
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from rl2grid.agents.agent import Action, Agent, topology_part
 from rl2grid.engines.worlds import World
+from rl2grid.errors import UsageError
 from rl2grid.handles import AsOpened
 from rl2grid.mdp.actions import TOPOLOGY
 from rl2grid.mdp.heuristics import is_safe
@@ -21,6 +23,43 @@ EARLIER = (1, 3, 6, 12, 24, 48)
 """Decisions before the grid became unsafe at which something else is tried as well."""
 PAST = 24
 """Grid steps after the moment of a death that an attempt must survive to have averted it."""
+
+
+@dataclass(frozen=True)
+class Reach:
+    """How far is looked, and how much is tried.
+
+    Raises:
+        UsageError: one of the three is no whole number of at least 1.
+    """
+
+    ahead: int
+    candidates: int
+    """Other actions that are tried per decision: the best ones by the worst loading in the next step."""
+    attempts: int
+
+    def __post_init__(self) -> None:
+        for name, value in asdict(self).items():
+            if not isinstance(value, Integral) or isinstance(value, bool) or value < 1:
+                raise UsageError(f"{name}={value!r} is not allowed: give a whole number, at least 1.")
+
+
+def check_guide(guide: Agent | None) -> None:
+    """Refuse a guide that is no agent.
+
+    Raises:
+        UsageError: it is none, nor None.
+    """
+    if not (guide is None or isinstance(guide, Agent)):
+        raise UsageError(f"guide={guide!r} is not allowed: give an agent, such as Planner(), or None.")
+
+
+def name_with(name: str, guide: Agent | None, reach: Reach, usual: Reach) -> str:
+    """What an agent is called: who guides it and how far it looks, where that is not as by default."""
+    usually = asdict(usual)
+    guided = [] if guide is None else [f"guided by {guide.name}"]
+    details = guided + [f"{each} {value}" for each, value in asdict(reach).items() if value != usually[each]]
+    return f"{name} ({', '.join(details)})" if details else name
 
 
 class Decision(NamedTuple):

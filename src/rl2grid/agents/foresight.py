@@ -5,21 +5,31 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from numbers import Integral
 from typing import Any
 
 import gymnasium
 import numpy as np
 
 from rl2grid.agents.agent import Action, Agent, Considered, Info, Observation
-from rl2grid.agents.courses import EARLIER, Attempt, Averted, Course, Courses, Decision, begin_of_crisis
+from rl2grid.agents.courses import (
+    EARLIER,
+    Attempt,
+    Averted,
+    Course,
+    Courses,
+    Decision,
+    Reach,
+    begin_of_crisis,
+    check_guide,
+    name_with,
+)
 from rl2grid.agents.planner import Foretold, Planner
 from rl2grid.agents.trend import undispatched
 from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.engines.worlds import World
 from rl2grid.errors import UsageError
 
-_AHEAD, _CANDIDATES, _ATTEMPTS = 96, 24, 300
+_USUAL = Reach(ahead=96, candidates=24, attempts=300)
 """Decisions played in advance, actions tried per decision and attempts per death, unless others are asked for."""
 
 
@@ -57,21 +67,14 @@ class Foresight:
     def __init__(
         self,
         guide: Agent | None = None,
-        ahead: int = _AHEAD,
-        candidates: int = _CANDIDATES,
-        attempts: int = _ATTEMPTS,
+        ahead: int = _USUAL.ahead,
+        candidates: int = _USUAL.candidates,
+        attempts: int = _USUAL.attempts,
     ) -> None:
-        asked = {"ahead": ahead, "candidates": candidates, "attempts": attempts}
-        for name, value in asked.items():
-            if not isinstance(value, Integral) or isinstance(value, bool) or value < 1:
-                raise UsageError(f"{name}={value!r} is not allowed: give a whole number, at least 1.")
-        if not (guide is None or isinstance(guide, Agent)):
-            raise UsageError(f"guide={guide!r} is not allowed: give an agent, such as Planner(), or None.")
-        self._guide = Planner() if guide is None else guide
-        usual = {"ahead": _AHEAD, "candidates": _CANDIDATES, "attempts": _ATTEMPTS}
-        guided = [] if guide is None else [f"guided by {guide.name}"]
-        details = guided + [f"{name} {value}" for name, value in asked.items() if value != usual[name]]
-        self.name = f"foresight ({', '.join(details)})" if details else "foresight"
+        check_guide(guide)
+        reach = Reach(ahead, candidates, attempts)
+        self._guide: Agent = Planner() if guide is None else guide
+        self.name = name_with("foresight", guide, reach, _USUAL)
         self._ahead, self._candidates, self._attempts = ahead, candidates, attempts
 
     def bind(self, env: gymnasium.Env[Any, Any]) -> None:

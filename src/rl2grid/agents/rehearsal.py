@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from numbers import Integral
 from typing import Any
 
 import gymnasium
@@ -19,7 +18,7 @@ from rl2grid.agents.agent import (
     OverruledAgent,
     topology_part,
 )
-from rl2grid.agents.courses import Averted, Course, Courses
+from rl2grid.agents.courses import Averted, Course, Courses, Reach, check_guide, name_with
 from rl2grid.agents.planner import Planner
 from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.errors import UsageError
@@ -27,7 +26,7 @@ from rl2grid.handles import AsOpened
 from rl2grid.mdp.heuristics import is_safe
 from rl2grid.mdp.state import GridState
 
-_AHEAD, _CANDIDATES, _ATTEMPTS = 24, 24, 300
+_USUAL = Reach(ahead=24, candidates=24, attempts=300)
 """Steps that must be survived, actions tried per decision and attempts per crisis, unless others are asked for."""
 _AT_ONCE = 60
 """Attempts at one decision."""
@@ -62,22 +61,15 @@ class Rehearsal:
     def __init__(
         self,
         guide: Agent | None = None,
-        ahead: int = _AHEAD,
-        candidates: int = _CANDIDATES,
-        attempts: int = _ATTEMPTS,
+        ahead: int = _USUAL.ahead,
+        candidates: int = _USUAL.candidates,
+        attempts: int = _USUAL.attempts,
     ) -> None:
-        asked = {"ahead": ahead, "candidates": candidates, "attempts": attempts}
-        for name, value in asked.items():
-            if not isinstance(value, Integral) or isinstance(value, bool) or value < 1:
-                raise UsageError(f"{name}={value!r} is not allowed: give a whole number, at least 1.")
-        if not (guide is None or isinstance(guide, Agent)):
-            raise UsageError(f"guide={guide!r} is not allowed: give an agent, such as Planner(), or None.")
+        check_guide(guide)
+        reach = Reach(ahead, candidates, attempts)
         self._guide: Agent = Planner() if guide is None else guide
         self._understudy = copy.deepcopy(self._guide)
-        usual = {"ahead": _AHEAD, "candidates": _CANDIDATES, "attempts": _ATTEMPTS}
-        guided = [] if guide is None else [f"guided by {guide.name}"]
-        details = guided + [f"{name} {value}" for name, value in asked.items() if value != usual[name]]
-        self.name = f"rehearsal ({', '.join(details)})" if details else "rehearsal"
+        self.name = name_with("rehearsal", guide, reach, _USUAL)
         self._ahead, self._candidates, self._attempts = ahead, candidates, attempts
 
     def bind(self, env: gymnasium.Env[Any, Any]) -> None:

@@ -12,7 +12,10 @@ from rl2grid.records.looks import by_present_rules
 from rl2grid.records.statistics import aggregated
 
 KINDS = ("do nothing", "search and rules", "planner", "learned")
-"""What agents are told apart by: nothing is ever done; no training, but a model of the grid or a rule; learned."""
+"""What agents are told apart by: nothing is ever done; no training, but a model of the grid or a rule; sequences of
+actions on forecasts; learned."""
+PLANNERS = ("planner", "rehearsal")
+"""Agents of the third kind; cells name those that are not called like it."""
 USUAL_MONTHS = 500
 """Of the test list; a cell says the number where fewer were played."""
 
@@ -44,7 +47,7 @@ def kind_of(result: HashedTest) -> str:
     """Which of :data:`KINDS` played."""
     if result.has_learned:
         return "learned"
-    if result.agent == "planner":
+    if result.agent in PLANNERS:
         return "planner"
     return "do nothing" if result.label == "do-nothing" else "search and rules"
 
