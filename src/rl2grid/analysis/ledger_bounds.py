@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from rl2grid.analysis.ledger_overview import KINDS, best_row, by_task, kind_of
+from rl2grid.analysis.ledger_overview import DO_NOTHING, KINDS, PLANNER, best_row, by_task, kind_of
 from rl2grid.analysis.ledger_table import LedgerRow
 from rl2grid.analysis.table import markdown_row
 from rl2grid.arrays import F64
@@ -45,19 +45,25 @@ def _cells(bound: HashedTest, rows: Sequence[LedgerRow], results: Mapping[str, H
     months = int(bound.months["number"])
     comparable = [row for row in rows if common_months(bound.months, row.first.months) == months]
     best = {kind: best_row([row for row in comparable if kind_of(row.first) == kind]) for kind in KINDS}
-    of_kinds = {kind: None if row is None else _survival(row.results, months) for kind, row in best.items()}
     known = _survival([bound], months)
     anybody = _longest([bound, *_others(bound, results)], months)
-    planner = of_kinds["planner"]
+    planner = best["planner"]
     return [
         short_id(bound.task),
         f"`{bound.heuristic}`" if bound.heuristic else "",
         str(months),
-        *("" if value is None else f"{value:.3f}" for value in of_kinds.values()),
+        *("" if row is None else _named(row, months) for row in best.values()),
         f"{known:.3f}",
         f"**{anybody:.3f}**",
-        "" if planner is None else f"{planner / anybody:.0%}",
+        "" if planner is None else f"{_survival(planner.results, months) / anybody:.0%}",
     ]
+
+
+def _named(row: LedgerRow, months: int) -> str:
+    """What it survives, and who it is where its column does not say that."""
+    survival = f"{_survival(row.results, months):.3f}"
+    is_told = row.first.label == DO_NOTHING or row.first.agent == PLANNER
+    return survival if is_told else f"{survival} {row.label}"
 
 
 def _others(bound: HashedTest, results: Mapping[str, HashedTest]) -> list[HashedTest]:

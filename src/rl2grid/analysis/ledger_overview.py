@@ -14,7 +14,8 @@ from rl2grid.records.statistics import aggregated
 KINDS = ("do nothing", "search and rules", "planner", "learned")
 """What agents are told apart by: nothing is ever done; no training, but a model of the grid or a rule; sequences of
 actions on forecasts; learned."""
-PLANNERS = ("planner", "rehearsal")
+DO_NOTHING, PLANNER = "do-nothing", "planner"
+PLANNERS = (PLANNER, "rehearsal")
 """Agents of the third kind; cells name those that are not called like it."""
 USUAL_MONTHS = 500
 """Of the test list; a cell says the number where fewer were played."""
@@ -49,7 +50,7 @@ def kind_of(result: HashedTest) -> str:
         return "learned"
     if result.agent in PLANNERS:
         return "planner"
-    return "do nothing" if result.label == "do-nothing" else "search and rules"
+    return "do nothing" if result.label == DO_NOTHING else "search and rules"
 
 
 def best_row(rows: Sequence[LedgerRow]) -> LedgerRow | None:
@@ -66,7 +67,7 @@ def _cell(row: LedgerRow | None, highest: float) -> str:
         return ""
     survival = f"{_survival(row):.3f}"
     shown = f"**{survival}**" if _survival(row) == highest else survival
-    label = "" if row.first.label in ("do-nothing", "planner") else f" {row.first.label}"
+    label = "" if row.first.label in (DO_NOTHING, PLANNER) else f" {row.first.label}"
     remarks = ", ".join(_remarks(row))
     return shown + label + (f" ({remarks})" if remarks else "")
 
