@@ -32,7 +32,9 @@ def test_everybody_is_compared_on_the_months_of_the_bound():
         "the planner reaches |"
     )
     # Who survives longest of all months is shown by the months of the bound; anybody: 0.8 and 0.9.
-    assert row == "| bus14-T0 | `idle` | 2 | 0.150 | 0.600 greedy | 0.500 | 0.300 ppo + idle | 0.650 | **0.850** | 59% |"
+    assert row == (
+        "| bus14-T0 | `idle` | 2 | 0.150 | 0.600 greedy | 0.500 | 0.300 ppo + idle | 0.650 | **0.850** | 59% |"
+    )
 
 
 def test_what_somebody_survived_by_earlier_rules_can_be_survived():
