@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rl2grid.agents.agent import Action, Agent, topology_part
+from rl2grid.agents.planner import Planner
 from rl2grid.engines.worlds import World
 from rl2grid.errors import UsageError
 from rl2grid.handles import AsOpened
@@ -44,22 +45,30 @@ class Reach:
                 raise UsageError(f"{name}={value!r} is not allowed: give a whole number, at least 1.")
 
 
-def check_guide(guide: Agent | None) -> None:
-    """Refuse a guide that is no agent.
+class Guided:
+    """An agent that lets another one play on.
+
+    Args:
+        guide: who that is; None: the planner.
+        reach: how far is looked.
+        usual: how far by default; the name says where it is otherwise, and who guides if somebody was given.
 
     Raises:
-        UsageError: it is none, nor None.
+        UsageError: the guide is no agent.
     """
-    if not (guide is None or isinstance(guide, Agent)):
-        raise UsageError(f"guide={guide!r} is not allowed: give an agent, such as Planner(), or None.")
 
+    name: str
 
-def name_with(name: str, guide: Agent | None, reach: Reach, usual: Reach) -> str:
-    """What an agent is called: who guides it and how far it looks, where that is not as by default."""
-    usually = asdict(usual)
-    guided = [] if guide is None else [f"guided by {guide.name}"]
-    details = guided + [f"{each} {value}" for each, value in asdict(reach).items() if value != usually[each]]
-    return f"{name} ({', '.join(details)})" if details else name
+    def __init__(self, guide: Agent | None, reach: Reach, usual: Reach) -> None:
+        if not (guide is None or isinstance(guide, Agent)):
+            raise UsageError(f"guide={guide!r} is not allowed: give an agent, such as Planner(), or None.")
+        usually = asdict(usual)
+        details = [f"guided by {guide.name}"] if guide is not None else []
+        details += [f"{each} {value}" for each, value in asdict(reach).items() if value != usually[each]]
+        if details:
+            self.name = f"{self.name} ({', '.join(details)})"
+        self._guide: Agent = Planner() if guide is None else guide
+        self._reach = reach
 
 
 class Decision(NamedTuple):
@@ -119,20 +128,30 @@ class Courses:
         """A new episode begins."""
         self._guide.reset(0)
 
-    def play(self, world: World, first: Action | None, most: int | None, until: int | None = None) -> Course:
-        """Let the guide play on, after an action of one's own.
+    def play(
+        self, world: World, first: Sequence[Action] = (), most: int | None = None, until: int | None = None
+    ) -> Course:
+        """Let the guide play on, after actions of one's own.
 
         Args:
             world: where it begins.
-            first: the action that is played first; None: the guide's.
+            first: the actions that are played first, one after the other.
             most: decisions at most.
             until: the grid step at which it ends.
         """
-        return self._course(world, () if first is None else (first,), most, until)
-
-    def follow(self, world: World, actions: Sequence[Action], until: int) -> Course:
-        """Play actions, one after the other, and let the guide play on from there, until a grid step."""
-        return self._course(world, actions, None, until)
+        env = self._env
+        observation, info = env.restore(world)
+        state, decisions, over = env.state, list[Decision](), False
+        lost = False
+        while not over and (most is None or len(decisions) < most) and (until is None or int(state.step[0]) < until):
+            before = env.save() if decisions else world
+            step, safe = int(state.step[0]), is_safe(self._opened(state), 0)
+            played = len(decisions)
+            action = first[played] if played < len(first) else self._guide.act(observation, info)
+            observation, _, lost, completed, info = env.step(action)
+            decisions.append(Decision(before, step, safe, action))
+            over = lost or completed
+        return Course(decisions, None if over else env.save(), bool(lost), int(info["step"]))
 
     def averted(self, course: Course, attempts: int) -> Averted:
         """A course that outlives the end of the given one by far enough; if none is found, the one that lives longest.
@@ -162,7 +181,7 @@ class Courses:
 
     def tried(self, attempt: Attempt, world: World, until: int) -> Course:
         """What comes of an attempt, until a grid step."""
-        return self.play(world, attempt.action, None, until)
+        return self.play(world, () if attempt.action is None else (attempt.action,), until=until)
 
     def attempts_at(self, decisions: Sequence[Decision]) -> Iterator[Attempt]:
         """What is tried: other topology actions, the last decisions first."""
@@ -180,22 +199,6 @@ class Courses:
         loading = np.where(outcomes.legal, outcomes.worst_loading, np.inf)
         best = np.argsort(loading, kind="stable")[: self._candidates]
         return [int(action) for action in dict.fromkeys([*best[np.isfinite(loading[best])].tolist(), 0])]
-
-    def _course(self, world: World, first: Sequence[Action], most: int | None, until: int | None) -> Course:
-        """Actions of one's own, then the guide's."""
-        env = self._env
-        observation, info = env.restore(world)
-        state, decisions, over = env.state, list[Decision](), False
-        lost = False
-        while not over and (most is None or len(decisions) < most) and (until is None or int(state.step[0]) < until):
-            before = env.save() if decisions else world
-            step, safe = int(state.step[0]), is_safe(self._opened(state), 0)
-            played = len(decisions)
-            action = first[played] if played < len(first) else self._guide.act(observation, info)
-            observation, _, lost, completed, info = env.step(action)
-            decisions.append(Decision(before, step, safe, action))
-            over = lost or completed
-        return Course(decisions, None if over else env.save(), bool(lost), int(info["step"]))
 
 
 def begin_of_crisis(decisions: Sequence[Decision]) -> int:

@@ -18,10 +18,9 @@ from rl2grid.agents.courses import (
     Course,
     Courses,
     Decision,
+    Guided,
     Reach,
     begin_of_crisis,
-    check_guide,
-    name_with,
 )
 from rl2grid.agents.planner import Foretold, Planner
 from rl2grid.agents.trend import undispatched
@@ -40,7 +39,7 @@ class _Telling(Attempt):
     foretold: Foretold
 
 
-class Foresight:
+class Foresight(Guided):
     """Plays the true future in advance and takes back what ends badly: a bound, not a player.
 
     It lets a guide, the planner, play on from saved true worlds, some hours ahead of the episode. Where that ends in a
@@ -71,11 +70,7 @@ class Foresight:
         candidates: int = _USUAL.candidates,
         attempts: int = _USUAL.attempts,
     ) -> None:
-        check_guide(guide)
-        reach = Reach(ahead, candidates, attempts)
-        self._guide: Agent = Planner() if guide is None else guide
-        self.name = name_with("foresight", guide, reach, _USUAL)
-        self._ahead, self._candidates, self._attempts = ahead, candidates, attempts
+        super().__init__(guide, Reach(ahead, candidates, attempts), _USUAL)
 
     def bind(self, env: gymnasium.Env[Any, Any]) -> None:
         """Make a copy of the environment, in which the future is played.
@@ -93,7 +88,7 @@ class Foresight:
         if not isinstance(base.engine, NativeEngine):
             raise UsageError(f'Agent {self.name!r} asks what-ifs of the native engine: choose engine="native".')
         self._present = base
-        self._courses = _Told(base, self._guide, self._candidates, self._ahead)
+        self._courses = _Told(base, self._guide, self._reach)
 
     def reset(self, i: int) -> None:
         """Forget what was foreseen."""
@@ -108,7 +103,7 @@ class Foresight:
         self._why = ""
         if not self._course:
             self._end = self._present.save()
-        while not self._ends and len(self._course) < self._ahead:
+        while not self._ends and len(self._course) < self._reach.ahead:
             self._go_on()
         return self._course.popleft().action
 
@@ -124,10 +119,10 @@ class Foresight:
     def _go_on(self) -> None:
         """Extend the course, by what averts a death where there is one."""
         assert self._end is not None
-        course = self._courses.play(self._end, None, self._ahead - len(self._course))
+        course = self._courses.play(self._end, most=self._reach.ahead - len(self._course))
         decisions = [*self._course, *course.decisions]
         if course.lost:
-            averted = self._courses.averted(course._replace(decisions=decisions), self._attempts)
+            averted = self._courses.averted(course._replace(decisions=decisions), self._reach.attempts)
             self._why = _reason(course.step, averted)
             course = averted.course
             decisions = course.decisions
@@ -137,19 +132,19 @@ class Foresight:
 class _Told(Courses):
     """Where power can be dispatched, the planner is told what comes before anything else is tried."""
 
-    def __init__(self, env: Any, guide: Agent, candidates: int, ahead: int) -> None:
-        super().__init__(env, guide, candidates)
-        self._task, self._ahead = env.task, ahead
+    def __init__(self, env: Any, guide: Agent, reach: Reach) -> None:
+        super().__init__(env, guide, reach.candidates)
+        self._ahead = reach.ahead
 
     def attempts_at(self, decisions: Sequence[Decision]) -> Iterator[Attempt]:
-        if isinstance(self._guide, Planner) and self._task.injects:
+        if isinstance(self._guide, Planner) and self._env.task.injects:
             crisis, foretold = begin_of_crisis(decisions), self._foretold(decisions[-1].world)
             for earlier in (0, *EARLIER, self._ahead):
                 at = max(crisis - earlier, 0)
                 yield _Telling(decisions[: at + 1], foretold=self._lost_from(decisions[at].world, foretold))
                 if at == 0:
                     break
-        if self._task.changes_topology:
+        if self._env.task.changes_topology:
             yield from super().attempts_at(decisions)
 
     def tried(self, attempt: Attempt, world: World, until: int) -> Course:
@@ -157,7 +152,7 @@ class _Told(Courses):
             return super().tried(attempt, world, until)
         assert isinstance(self._guide, Planner)
         self._guide.forewarn(attempt.foretold)
-        played = self.play(world, None, None, until)
+        played = self.play(world, until=until)
         self._guide.forewarn(None)
         return played
 

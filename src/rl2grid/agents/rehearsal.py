@@ -18,8 +18,7 @@ from rl2grid.agents.agent import (
     OverruledAgent,
     topology_part,
 )
-from rl2grid.agents.courses import Averted, Course, Courses, Reach, check_guide, name_with
-from rl2grid.agents.planner import Planner
+from rl2grid.agents.courses import Averted, Course, Courses, Guided, Reach
 from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.errors import UsageError
 from rl2grid.handles import AsOpened
@@ -32,7 +31,7 @@ _AT_ONCE = 60
 """Attempts at one decision."""
 
 
-class Rehearsal:
+class Rehearsal(Guided):
     """Plays what its guide, the planner, plays; in a crisis, only after it went well in an imagined world.
 
     While the grid is safe, the guide decides. When it is not, what the guide would play is played on from an imagined
@@ -65,12 +64,8 @@ class Rehearsal:
         candidates: int = _USUAL.candidates,
         attempts: int = _USUAL.attempts,
     ) -> None:
-        check_guide(guide)
-        reach = Reach(ahead, candidates, attempts)
-        self._guide: Agent = Planner() if guide is None else guide
+        super().__init__(guide, Reach(ahead, candidates, attempts), _USUAL)
         self._understudy = copy.deepcopy(self._guide)
-        self.name = name_with("rehearsal", guide, reach, _USUAL)
-        self._ahead, self._candidates, self._attempts = ahead, candidates, attempts
 
     def bind(self, env: gymnasium.Env[Any, Any]) -> None:
         """Make a copy of the environment, in which crises are rehearsed.
@@ -88,16 +83,16 @@ class Rehearsal:
         if not isinstance(base.engine, NativeEngine):
             raise UsageError(f'Agent {self.name!r} imagines worlds of the native engine: choose engine="native".')
         self._env = base
-        self._kept: Sequence[Action] = []
         self._opened: AsOpened[GridState] = AsOpened()
-        self._courses = Courses(base, self._understudy, self._candidates)
+        self._courses = Courses(base, self._understudy, self._reach.candidates)
         self._guide.bind(env)
 
     def reset(self, i: int) -> None:
         """A new episode: nothing is kept, and no attempt was made."""
         self._guide.reset(0)
         self._courses.reset()
-        self._calm()
+        self._kept: Sequence[Action] = []
+        self._left, self._why = self._reach.attempts, ""
 
     def act(self, observation: Observation, info: Info) -> Action:
         """The guide's action, or that of the course that went well."""
@@ -105,7 +100,7 @@ class Rehearsal:
         self._why = ""
         proposed = self._guide.act(observation, info)
         if is_safe(self._opened(state), 0):
-            self._calm()
+            self._kept, self._left = [], self._reach.attempts
             return proposed
         course = self._rehearsed(int(state.step[0]), proposed)
         action = course.decisions[0].action
@@ -126,18 +121,14 @@ class Rehearsal:
             return Considered("", (), (), self._why)
         return self._guide.explain() if isinstance(self._guide, ExplainingAgent) else None
 
-    def _calm(self) -> None:
-        self._kept = []
-        self._left, self._why = self._attempts, ""
-
     def _rehearsed(self, step: int, proposed: Action) -> Course:
         """The course that goes well, or lives longest."""
-        world, until = self._env.imagine(step), step + self._ahead
-        kept = self._courses.follow(world, self._kept, until) if self._kept else None
+        world, until = self._env.imagine(step), step + self._reach.ahead
+        kept = self._courses.play(world, self._kept, until=until) if self._kept else None
         if kept is not None and not kept.lost:
             self._why = "what was rehearsed before still goes well"
             return kept
-        guided = self._courses.follow(world, [proposed], until)
+        guided = self._courses.play(world, [proposed], until=until)
         if not guided.lost:
             self._why = "what the guide plays goes well"
             return guided
