@@ -18,9 +18,9 @@ from rl2grid.analysis.ledger_bounds import headroom_table
 from rl2grid.analysis.ledger_overview import best_row, by_task, kind_of
 from rl2grid.envs.tasks import find_task, short_id
 from rl2grid.evaluation.protocol import evaluate
+from rl2grid.ledger.subjects import tested_months
 from rl2grid.records.evaluations import identity_hash
 from rl2grid.records.ledger import HashedTest, add_test, hashed_test, read_ledger
-from rl2grid.scenarios.library import split_version
 from rl2grid.scenarios.splits import TEST
 
 RESULTS = Path(__file__).resolve().parent / "results"
@@ -44,7 +44,7 @@ def play(task_id: str, heuristic: str | None, months: int, attempts: int, folder
         "guide": {"agent": "planner", "rules": Planner.rules[task.kind]},
         "task": task.id,
         "heuristic": heuristic,
-        "test": {"split_version": split_version(task.grid_id, TEST), "months": months},
+        "test": tested_months(task, months),
     }
     digest = identity_hash(configuration)
     if digest in read_ledger(BOUNDS):
@@ -76,7 +76,13 @@ def main() -> None:
         print(headroom_table(results, read_ledger(BOUNDS)))
         return
     by_heuristic = heuristics(results)
-    for task in [find_task(name).id for name in arguments.tasks] or by_heuristic:
+    asked = [find_task(name).id for name in arguments.tasks]
+    for task in asked:
+        if task not in by_heuristic:
+            parser.error(
+                f"the planner had no test on {short_id(task)}: choose of {' '.join(map(short_id, by_heuristic))}"
+            )
+    for task in asked or by_heuristic:
         play(task, by_heuristic[task], arguments.months, arguments.attempts, arguments.folder)
 
 

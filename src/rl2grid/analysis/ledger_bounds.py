@@ -14,6 +14,7 @@ from rl2grid.envs.tasks import short_id
 from rl2grid.errors import UsageError
 from rl2grid.records.ledger import HashedTest
 from rl2grid.records.month_values import common_months, unpack_months
+from rl2grid.records.statistics import aggregated
 
 _HEADINGS = ("task", "heuristic", "months", *KINDS, "with foresight", "anybody", "the planner reaches")
 
@@ -45,7 +46,7 @@ def _cells(bound: HashedTest, rows: Sequence[LedgerRow], results: Mapping[str, H
     months = int(bound.months["number"])
     comparable = [row for row in rows if common_months(bound.months, row.first.months) == months]
     best = {kind: best_row([row for row in comparable if kind_of(row.first) == kind]) for kind in KINDS}
-    known = _survival([bound], months)
+    known = _survived(bound, months).mean()
     anybody = _longest([bound, *_others(bound, results)], months)
     planner = best["planner"]
     return [
@@ -55,13 +56,13 @@ def _cells(bound: HashedTest, rows: Sequence[LedgerRow], results: Mapping[str, H
         *("" if row is None else _named(row, months) for row in best.values()),
         f"{known:.3f}",
         f"**{anybody:.3f}**",
-        "" if planner is None else f"{_survival(planner.results, months) / anybody:.0%}",
+        "" if planner is None else f"{_survival(planner, months) / anybody:.0%}",
     ]
 
 
 def _named(row: LedgerRow, months: int) -> str:
     """What it survives, and who it is where its column does not say that."""
-    survival = f"{_survival(row.results, months):.3f}"
+    survival = f"{_survival(row, months):.3f}"
     is_told = row.first.label == DO_NOTHING or row.first.agent == PLANNER
     return survival if is_told else f"{survival} {row.label}"
 
@@ -77,8 +78,8 @@ def _survived(result: HashedTest, months: int) -> F64:
     return unpack_months(result.values, int(result.months["seeds"]))["survival"][:months]
 
 
-def _survival(results: Iterable[HashedTest], months: int) -> float:
-    return float(np.mean([_survived(one, months) for one in results]))
+def _survival(row: LedgerRow, months: int) -> float:
+    return aggregated(row.scores("survival", months))
 
 
 def _longest(results: Iterable[HashedTest], months: int) -> float:

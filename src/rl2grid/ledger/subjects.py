@@ -147,7 +147,7 @@ def _play(subject: Subject, agent: str | Path, progress: bool) -> Evaluation:
     return result
 
 
-def _test_of(task: Task, months: int | None) -> dict[str, Any]:
+def tested_months(task: Task, months: int | None) -> dict[str, Any]:
     """Which months a configuration is tested on: on others, it is another one."""
     number = len(first_months(task, TEST, months))
     return {"split_version": split_version(task.grid_id, TEST), "months": number}
@@ -178,7 +178,7 @@ def _untrained(agent: str, task: Task, heuristic: str | None, months: int | None
         raise UsageError(f"Agent {agent!r} knows the future: it is not ranked, and has no test.")
     check_playable(made, task, {"split": TEST, "heuristic": heuristic})
     configuration: dict[str, Any] = {"agent": agent, "task": task.id, "heuristic": heuristic}
-    configuration["test"] = _test_of(task, months)
+    configuration["test"] = tested_months(task, months)
     if isinstance(made, RevisedAgent) and task.kind in made.rules:
         configuration["rules"] = made.rules[task.kind]
     return Subject(configuration, agent, task, heuristic, {})
@@ -192,7 +192,7 @@ def _of_the_package(name: str, months: int | None) -> Subject:
         "policy_hash": card.policy_hash,
         "task": task.id,
         "heuristic": card.heuristic,
-        "test": _test_of(task, months),
+        "test": tested_months(task, months),
     }
     return Subject(configuration, name, task, card.heuristic, {})
 
@@ -216,7 +216,7 @@ def _trained(folder: Path, months: int | None) -> Subject:
         },
         "env_keywords": _frozen(args.env_keywords),
         "targets_version": identity.get("targets_version", 1),
-        "test": _test_of(args.task, months),
+        "test": tested_months(args.task, months),
         **_learned_from(identity),
     }
     policy = load_agent(folder)
