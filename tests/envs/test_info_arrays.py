@@ -58,7 +58,7 @@ def infos(state: GridState, told: np.ndarray, constraint: int) -> dict[str, Any]
     handle = Handle(state)
     write_report(handle.address, np.flatnonzero(told), constraint, EPISODES, OVER, *report)
     words = np.array([[f"{name} {i}" if told[i] else None for i in range(N)] for name in NAMES], object)
-    return InfoForm(NAMES, True).named(words, report, told)
+    return InfoForm(NAMES, True, N).named(words, report, told)
 
 
 @pytest.mark.parametrize(("constraint", "column"), [(None, -1), ("LSI", 0), ("TLO", 1)])
@@ -76,8 +76,21 @@ def test_where_only_some_have_infos_those_of_others_are_blank(state, ended):
 
 
 def test_keys_are_there_where_they_are_meant_to_be():
-    report, everywhere = blank_report(N, GRID.n_line), np.ones(N, np.bool_)
-    named = InfoForm(["scenario"], False).named(np.full((1, N), "", object), report, everywhere)
+    report = blank_report(N, GRID.n_line)
+    named = InfoForm(["scenario"], False, N).named(np.full((1, N), "", object), report)
     assert "scenario" in named
     assert "discounted_reward" not in named
     assert "action_set_hash" not in named
+
+
+def test_where_all_have_infos_steps_share_a_mask_that_cannot_be_written():
+    form, words = InfoForm(NAMES, True, N), np.full((len(NAMES), N), "", object)
+    infos, later = (form.named(words, blank_report(N, GRID.n_line)) for _ in range(2))
+    explicit = form.named(words, blank_report(N, GRID.n_line), np.ones(N, np.bool_))
+    assert_same(copied(infos), copied(explicit))
+    infos["step"][:] = 7
+    infos["costs"]["LSI"][:] = 7
+    infos["mine"] = infos["costs"]["mine"] = 7
+    assert_same(copied(later), copied(explicit))
+    with pytest.raises(ValueError, match="read-only"):
+        infos["_step"][0] = False

@@ -53,7 +53,7 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
         self._shown_effects = np.full(n, "", object)
         self._nothing = np.full(n, None, object)
         self._cost = -1 if self.constraint is None else COSTS.index(self.constraint)
-        self._form = InfoForm([*_WORDS, *(["action_set_hash"] if self._hashes else [])], options.gamma is not None)
+        self._form = InfoForm([*_WORDS, *(["action_set_hash"] if self._hashes else [])], options.gamma is not None, n)
         self._all_begun = False  # every row was reset or restored once
 
     def reset(self, seeds: list[int | None], options: dict[str, Any] | None) -> Batch:
@@ -237,5 +237,5 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
         report = self._report(self._rows)
         reasons = GAME_OVER_WORDS.take(report.counts[reports.GAME_OVER])
         words = (self._scenarios.copy(), reasons, effects, *(each.copy() for each in self._hashes))
-        infos = self._form.named(words, report, np.ones(self._n, np.bool_))
+        infos = self._form.named(words, report)
         return Batch(self._observations(), rewards, terminated, truncated, infos)

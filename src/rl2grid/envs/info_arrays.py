@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +44,15 @@ _DICTS = {
     reports.EPISODE_COSTS: ("episode_costs", COSTS),
     reports.EPISODE_SCORES: ("scores", SCORES),
 }
-"""By the line of the first entry: the key, and the names of the entries."""
+"""By the line of the first entry: the key, and the names of the entries. Behind the numbers, with nothing between."""
+
+
+class _Blank(NamedTuple):
+    """Infos whose values are still to be put in, each beside its mask."""
+
+    infos: dict[str, Any]
+    dicts: list[dict[str, Any]]
+    """Of each key of ``_DICTS``."""
 
 
 class InfoForm:
@@ -55,36 +63,56 @@ class InfoForm:
     Args:
         words: keys of texts and of what ``str`` makes texts of.
         tells_discounted: whether there is a discounted reward.
+        n: number of environments.
     """
 
-    def __init__(self, words: Sequence[str], tells_discounted: bool) -> None:
-        names = [_COUNTS, _FLAGS, _NUMBERS]
-        self._keys = [*words, *(lines[line] for lines in names for line in range(len(lines))), "attacked_lines"]
-        self._dicts = [
-            (key, slice(first, first + len(entries)), entries, _beside_masks(entries))
-            for first, (key, entries) in _DICTS.items()
-        ]
-        self._all = _beside_masks((*self._keys, *(key for key, *_ in self._dicts)))
+    def __init__(self, words: Sequence[str], tells_discounted: bool, n: int) -> None:
+        self._words = list(words)
+        self._counts, self._flags, self._numbers = (
+            [lines[line] for line in range(len(lines))] for lines in (_COUNTS, _FLAGS, _NUMBERS)
+        )
+        self._dicts = [_DICTS[first] for first in sorted(_DICTS)]
         self._tells_discounted = tells_discounted
+        everybody = np.ones(n, np.bool_)
+        everybody.flags.writeable = False
+        self._blank = self._blank_of(everybody)
 
-    def named(self, words: Sequence[Words], report: Report, told: Flags) -> dict[str, Any]:
+    def named(self, words: Sequence[Words], report: Report, told: Flags | None = None) -> dict[str, Any]:
         """Infos by key of :data:`rl2grid.envs.info.INFO_KEYS`, arrays [n] or dicts of such, each beside its mask.
 
         Args:
             words: object [n] for each key.
             report: the numbers.
-            told: the mask of every key, bool [n]: the environments that have infos.
+            told: the mask of every key, bool [n]: the environments that have infos. None: all have; the mask, which
+                all steps share, cannot be written.
         """
-        numbers = list(report.numbers)
-        values = (*words, *report.counts, *report.flags, *numbers[: len(_NUMBERS)], report.attacked)
-        infos: dict[str, Any] = dict.fromkeys(self._all, told)
-        infos.update(zip(self._keys, values, strict=True))
-        for key, lines, entries, names in self._dicts:
-            infos[key] = entries_of = dict.fromkeys(names, told)
-            entries_of.update(zip(entries, numbers[lines], strict=True))
+        blank = self._blank if told is None else self._blank_of(told)
+        infos, numbers = blank.infos.copy(), iter(report.numbers)
+        # Assigned one by one: for so few that is faster than to update.
+        for key, word in zip(self._words, words, strict=True):
+            infos[key] = word
+        for key, count in zip(self._counts, report.counts, strict=True):
+            infos[key] = count
+        for key, flag in zip(self._flags, report.flags, strict=True):
+            infos[key] = flag
+        for key in self._numbers:
+            infos[key] = next(numbers)
+        infos["attacked_lines"] = report.attacked
+        for (key, entries), masks in zip(self._dicts, blank.dicts, strict=True):
+            infos[key] = entries_of = masks.copy()
+            for entry in entries:
+                entries_of[entry] = next(numbers)
         if not self._tells_discounted:
             del infos["discounted_reward"], infos["_discounted_reward"]
         return infos
+
+    def _blank_of(self, told: Flags) -> _Blank:
+        keys = [*self._words, *self._counts, *self._flags, *self._numbers, "attacked_lines"]
+        keys += [key for key, _ in self._dicts]
+        return _Blank(
+            dict.fromkeys(_beside_masks(keys), told),
+            [dict.fromkeys(_beside_masks(entries), told) for _, entries in self._dicts],
+        )
 
 
 def _beside_masks(keys: Sequence[str]) -> list[str]:

@@ -60,7 +60,12 @@ class CachedSeries:
 
 def data_folder() -> Path:
     """Where series are kept: ``$RL2GRID_DATA``, else the user's cache folder of this system."""
-    return Path(os.environ.get("RL2GRID_DATA") or platformdirs.user_cache_dir("rl2grid")).expanduser()
+    return _folder_of(os.environ.get("RL2GRID_DATA"))
+
+
+@functools.cache
+def _folder_of(given: str | None) -> Path:
+    return Path(given or platformdirs.user_cache_dir("rl2grid")).expanduser()
 
 
 def free_bytes() -> int:

@@ -322,7 +322,7 @@ class NativeTransitions(Transitions):
 
     def _order(self, rows: I64, commands: Commands) -> I64:
         """In which to play ``rows``: those together that will have one topology."""
-        keys = np.zeros_like(rows)
+        keys = np.zeros(len(rows), np.int64)
         if len(rows) > 1:
             write_topology_keys(
                 self.engine.address,
