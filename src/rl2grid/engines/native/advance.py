@@ -48,9 +48,8 @@ DEFAULT, PAPER, RELEASED = range(3)
 
 _NOTHING, _MOVE, _RESTORE = int(ActionKind.NOTHING), int(ActionKind.MOVE), int(ActionKind.RESTORE)
 
-_ABREAST = 16
-"""Rows that a thread plays at the same time: twice as many as flows are solved side by side, because the topologies of
-rows differ."""
+MOST_ABREAST = 32
+"""Rows that a thread can play at the same time."""
 
 _SPREAD = 6364136223846793005
 """Odd, and large: different topologies are unlikely to have the same key."""
@@ -66,6 +65,7 @@ def advance(
     rows: NDArray[np.int64],
     order: NDArray[np.int64],
     counter: NDArray[np.int64],
+    abreast: int,
     begins: bool,
     first: NDArray[np.int64],
     end: NDArray[np.int64],
@@ -89,6 +89,7 @@ def advance(
         rows: environments, int64 [k].
         order: in which they are played, int64 [k]; nothing but time depends on it. See :func:`write_topology_keys`.
         counter: int64 [1], how many of ``rows`` were taken so far, by all threads that play them together.
+        abreast: how many of them to play at the same time, at most ``MOST_ABREAST``; nothing but time depends on it.
         begins: the first rows of episodes are shown; nobody acts.
         first: the first change of each agent's action, int64 [k].
         end: the change behind its last one, int64 [k].
@@ -104,13 +105,13 @@ def advance(
     """
     environments = open_environments(address)
     state, orders = environments.state, environments.orders
-    under_way, status = np.empty(_ABREAST, np.int64), np.empty(_ABREAST, np.int64)
-    is_agents_step = np.empty(_ABREAST, np.bool_)
-    illegal, ambiguous = np.empty(_ABREAST, np.bool_), np.empty(_ABREAST, np.bool_)
+    under_way, status = np.empty(MOST_ABREAST, np.int64), np.empty(MOST_ABREAST, np.int64)
+    is_agents_step = np.empty(MOST_ABREAST, np.bool_)
+    illegal, ambiguous = np.empty(MOST_ABREAST, np.bool_), np.empty(MOST_ABREAST, np.bool_)
     n = taken = 0
     while True:
         # Heuristics play some rows a hundred times as long as others: who is done takes the next.
-        while n < _ABREAST and taken < rows.shape[0]:
+        while n < abreast and taken < rows.shape[0]:
             taken = take_next(np.int64(counter.ctypes.data))  # type: ignore[call-arg]
             if taken >= rows.shape[0]:
                 break

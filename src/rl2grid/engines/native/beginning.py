@@ -15,6 +15,7 @@ from rl2grid.compile import jit, owning_jit
 from rl2grid.engines.native.environments import Environments, open_environments, separate
 from rl2grid.engines.native.hidden_state import LOAD_P, LOAD_Q, PROD_P, PROD_V
 from rl2grid.engines.native.series import read_row
+from rl2grid.engines.native.side_by_side import reset_side_by_side
 from rl2grid.engines.native.step import reset_row
 from rl2grid.handles import opener
 from rl2grid.mdp.opponents import draw_attacks
@@ -99,12 +100,11 @@ def begin_episodes(
     """
     environments, years = open_environments(address), _open_library(library)
     for k in range(rows.shape[0]):
-        i, seed, number = rows[k], draws.seed[k], draws.number[k]
-        _hand_out(environments, i, n_steps)
+        _hand_out(environments, rows[k], n_steps)
         if attacked:
-            draw_attacks(environments.opponent, i, seed, stream_key(number, _OPPONENT), n_steps)
-        draws.redraws[k] = _find_start(environments, years, i, k, draws, maintained)
-        draws.start[k] = environments.hidden.month_row[i]
+            key = stream_key(draws.number[k], _OPPONENT)
+            draw_attacks(environments.opponent, rows[k], draws.seed[k], key, n_steps)
+    _find_starts(environments, years, rows, draws, maintained)
 
 
 @jit
@@ -122,26 +122,41 @@ def _hand_out(environments: Environments, i: int, n_steps: int) -> None:
 
 
 @jit
-def _find_start(environments: Environments, years: Library, i: int, k: int, draws: Draws, maintained: bool) -> int:
-    """Draw rows until nothing done overloads no line, and show the last; how many were drawn in vain."""
-    numbers = np.empty(1)
-    key = stream_key(draws.number[k], _START)
-    for redraws in range(MAX_REDRAWS):
-        fill_uniforms(draws.seed[k], key, redraws, numbers)
-        _show(environments, years, i, k, draws, int(numbers[0] * MAX_STEPS), maintained)
-        if _is_secure(environments, i):
-            return redraws
-    _show(environments, years, i, k, draws, 0, maintained)
-    return MAX_REDRAWS
+def _find_starts(environments: Environments, years: Library, rows: I64, draws: Draws, maintained: bool) -> None:
+    """Draw a start for each of ``rows`` until nothing done overloads no line, and show it."""
+    waiting, shown, status = np.arange(rows.shape[0]), np.empty_like(rows), np.empty_like(rows)
+    draws.redraws[:] = 0
+    n = rows.shape[0]
+    while n > 0:
+        for place in range(n):
+            k = waiting[place]
+            shown[place], draws.start[k] = rows[k], _draw_start(draws, k)
+            _point_at(environments, years, rows[k], k, draws, maintained)
+        reset_side_by_side(environments, shown, n, status)
+        n_shown, n = n, 0
+        for place in range(n_shown):
+            k = waiting[place]
+            if draws.redraws[k] < MAX_REDRAWS and not _is_secure(environments, rows[k]):
+                draws.redraws[k] += 1
+                waiting[n] = k
+                n += 1
 
 
 @jit
-def _show(
-    environments: Environments, years: Library, i: int, k: int, draws: Draws, start: int, maintained: bool
-) -> None:
-    """Show row ``start`` of the months drawn."""
+def _draw_start(draws: Draws, k: int) -> int:
+    """The next row in which episode ``k`` may start: the first one of all where too many were in vain."""
+    if draws.redraws[k] == MAX_REDRAWS:
+        return 0
+    numbers = np.empty(1)
+    fill_uniforms(draws.seed[k], stream_key(draws.number[k], _START), draws.redraws[k], numbers)
+    return int(numbers[0] * MAX_STEPS)
+
+
+@jit
+def _point_at(environments: Environments, years: Library, i: int, k: int, draws: Draws, maintained: bool) -> None:
+    """Point row ``i`` at the start of the months drawn, to be reset."""
     state, hidden = environments.state, environments.hidden
-    year, month = draws.year[k], draws.month[k]
+    year, month, start = draws.year[k], draws.month[k], draws.start[k]
     place = month * MONTH_STEPS + start
     for column in (LOAD_P, LOAD_Q, PROD_P):
         width = hidden.new_p.shape[1] if column == PROD_P else hidden.load_p.shape[1]
@@ -169,7 +184,6 @@ def _show(
         )
     state.terminated[i] = False
     state.game_over[i] = _NOT_OVER
-    reset_row(environments, i)
 
 
 @jit

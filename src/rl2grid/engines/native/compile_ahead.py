@@ -23,6 +23,7 @@ SIGNATURE = (
     _NUMBERS,  # rows
     _NUMBERS,  # order
     _NUMBERS,  # counter
+    types.int64,  # abreast
     types.boolean,  # begins
     _NUMBERS,  # first
     _NUMBERS,  # end

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from rl2grid.arrays import I64
 from rl2grid.compile import jit
 from rl2grid.engines.native.environments import open_environments
 from rl2grid.engines.native.generation import set_generators
+from rl2grid.engines.native.side_by_side import reset_side_by_side
 from rl2grid.engines.native.simulation import begin_simulation, copy_environment, finish_simulation
 from rl2grid.engines.native.step import begin_step, dispatch_or_lose, finish_step, lose_by_dispatch, reset_row
 
@@ -18,10 +21,8 @@ def reset_one(address: int, i: int) -> None:
 
 @jit
 def reset_rows(address: int, rows: I64) -> None:
-    """:func:`reset_one` for each of ``rows``, int64 [k]."""
-    environments = open_environments(address)
-    for i in rows:
-        reset_row(environments, i)
+    """:func:`reset_one` for each of ``rows``, int64 [k], together."""
+    reset_side_by_side(open_environments(address), rows, rows.shape[0], np.empty(rows.shape[0], np.int64))
 
 
 @jit

@@ -1,4 +1,4 @@
-"""One grid step of several environments, whose power flows are solved side by side where that can be.
+"""One grid step of several environments, or a reset, whose power flows are solved side by side where that can be.
 
 What a row plays does not depend on the others: :mod:`rl2grid.powerflow.warm_lanes`,
 :mod:`rl2grid.powerflow.cold_lanes`.
@@ -10,7 +10,14 @@ from rl2grid.arrays import I64
 from rl2grid.compile import jit
 from rl2grid.engines.native.environments import Environments, separate
 from rl2grid.engines.native.protections import SETTLED, begin_cascade, find_flow, prepare, trip_lines
-from rl2grid.engines.native.step import begin_step, dispatch_or_lose, end_step, set_scene
+from rl2grid.engines.native.step import (
+    begin_reset,
+    begin_step,
+    dispatch_or_lose,
+    end_reset,
+    end_step,
+    set_scene,
+)
 from rl2grid.powerflow.ac import CONVERGED, DIVERGED, PREPARED
 from rl2grid.powerflow.cold_lanes import is_like, solve_cold_side_by_side
 from rl2grid.powerflow.flow_lanes import LOST
@@ -33,13 +40,40 @@ def step_side_by_side(environments: Environments, rows: I64, n: int, status: I64
     """Play a grid step in the first ``n`` of ``rows``, whose orders are written; ``status`` [row] is workspace."""
     for k in range(n):
         status[k] = _begin(environments, rows[k])
-    while _find_all_flows(environments, rows, n, status):
-        for k in range(n):
-            if status[k] == CONVERGED:
-                status[k] = trip_lines(environments, rows[k], True)
+    _settle(environments, rows, n, status, True)
     for k in range(n):
         if status[k] != _LOST:
             end_step(environments, rows[k], status[k] == SETTLED)
+
+
+@jit
+def reset_side_by_side(environments: Environments, rows: I64, n: int, status: I64) -> None:
+    """Show the first rows of the series of the first ``n`` of ``rows``; ``status`` [row] is workspace.
+
+    Each as :func:`rl2grid.engines.native.step.reset_row` shows it.
+    """
+    for k in range(n):
+        status[k] = _begin_reset(environments, rows[k])
+    _settle(environments, rows, n, status, False)
+    for k in range(n):
+        end_reset(environments, rows[k], status[k] == SETTLED)
+
+
+@jit
+def _settle(environments: Environments, rows: I64, n: int, status: I64, soft: bool) -> None:
+    """Find flows, and let protections open lines, until no row is PREPARED; ``soft`` as of ``trip_lines``."""
+    while _find_all_flows(environments, rows, n, status):
+        for k in range(n):
+            if status[k] == CONVERGED:
+                status[k] = trip_lines(environments, rows[k], soft)
+
+
+@separate
+def _begin_reset(environments: Environments, i: int) -> int:
+    """Reset row ``i`` up to the power flow; the status of that."""
+    begin_reset(environments, i)
+    begin_cascade(environments, i)
+    return int(prepare(environments, i))
 
 
 @separate

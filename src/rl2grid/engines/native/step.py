@@ -42,11 +42,18 @@ def reset_row(environments: Environments, i: int) -> int:
 
     Grid2Op plays a step for that: nobody acts, overloads are not counted, but lines above the hard limit trip.
     """
-    state, hidden, flow = environments.state, environments.hidden, environments.flow
+    begin_reset(environments, i)
+    return end_reset(environments, i, flow_with_cascade(environments, i, False))
+
+
+@jit
+def begin_reset(environments: Environments, i: int) -> None:
+    """:func:`reset_row` up to the power flow."""
+    state, hidden = environments.state, environments.hidden
     blank_row(hidden, i)
     begin_generation(environments, i)
     begin_outages(hidden, i)
-    forget_flow(flow, i)
+    forget_flow(environments.flow, i)
     state.topo_vect[i] = 1
     state.time_before_cooldown_line[i] = 0
     state.time_before_cooldown_sub[i] = 0
@@ -58,7 +65,13 @@ def reset_row(environments: Environments, i: int) -> int:
     curtail(environments, i)
     _open_for_maintenance(state, i)
     set_generators(environments, i)
-    if not flow_with_cascade(environments, i, False):
+
+
+@jit
+def end_reset(environments: Environments, i: int, has_flow: bool) -> int:
+    """:func:`reset_row` from after the power flow and the cascade, which found a flow or not."""
+    state, hidden = environments.state, environments.hidden
+    if not has_flow:
         lose(state, i, game_over_by_flow(state, i))
         return 0
     remember_busbars(environments, i)

@@ -20,6 +20,7 @@ from rl2grid.engines.native.advance import (
     CAREFUL_RECONNECT,
     DEFAULT,
     IDLE,
+    MOST_ABREAST,
     PAPER,
     RECONNECT,
     RECOVERY,
@@ -74,6 +75,9 @@ _CODES = {
 """What a heuristic is where agents have topology actions, and where not."""
 _ROWS_PER_THREAD = 8
 """A thread with fewer rows than this costs more than it saves."""
+_ABREAST = 16
+"""Rows that a thread plays at the same time between which heuristics play: twice as many as flows are solved side by
+side, because the topologies of rows differ. More, and a thread still has many when the others are done."""
 
 
 @dataclass(frozen=True)
@@ -314,9 +318,11 @@ class NativeTransitions(Transitions):
 
     def _advance(self, rows: I64, commands: Commands, num_threads: int, begins: bool) -> None:
         counter, order = np.zeros(1, np.int64), self._order(rows, commands)
+        # Without a heuristic all are done after a step: a thread may take its share, whose topologies differ most.
+        abreast = _ABREAST if self.heuristic else min(MOST_ABREAST, -(-len(rows) // _parts(len(rows), num_threads)))
 
         def advance_some(thread: int, _: slice) -> None:
-            self._advance_some(thread, rows, order, counter, commands, begins)
+            self._advance_some(thread, rows, order, counter, abreast, commands, begins)
 
         self._in_threads(advance_some, len(rows), num_threads)
 
@@ -338,7 +344,7 @@ class NativeTransitions(Transitions):
 
     def _in_threads(self, play: Callable[[int, slice], None], n_rows: int, num_threads: int) -> None:
         """Call ``play`` with the number of a thread and a part of ``n_rows`` rows, in as many threads as pay off."""
-        parts = max(1, min(num_threads, n_rows // _ROWS_PER_THREAD))
+        parts = _parts(n_rows, num_threads)
         if parts == 1:
             play(0, slice(0, n_rows))
             return
@@ -361,13 +367,16 @@ class NativeTransitions(Transitions):
             self._securities.append(Handle(own))
         return self._securities[thread].address
 
-    def _advance_some(self, thread: int, rows: I64, order: I64, counter: I64, commands: Commands, begins: bool) -> None:
+    def _advance_some(
+        self, thread: int, rows: I64, order: I64, counter: I64, abreast: int, commands: Commands, begins: bool
+    ) -> None:
         weights = self.reward.weights
         advance(
             *self._addresses(thread),
             rows,
             order,
             counter,
+            abreast,
             begins,
             commands.first,
             commands.end,
@@ -386,3 +395,8 @@ class NativeTransitions(Transitions):
         if self.heuristic is None:
             return ALONE
         return _CODES[self.heuristic, changes_topology(self.kind)]
+
+
+def _parts(n_rows: int, num_threads: int) -> int:
+    """In how many threads rows are played."""
+    return max(1, min(num_threads, n_rows // _ROWS_PER_THREAD))
