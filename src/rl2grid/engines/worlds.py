@@ -326,7 +326,7 @@ def _history_of_plain(plain: Mapping[str, Any]) -> History:
 
 
 def _plain_plan(plan: EpisodePlan) -> dict[str, Any]:
-    return {name: _number(value) for name, value in asdict(plan).items()}
+    return {name: _number(value) for name, value in plan._asdict().items()}
 
 
 def _plain_standing(standing: Standing) -> dict[str, Any]:

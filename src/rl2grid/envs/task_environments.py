@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from datetime import datetime
-from typing import TYPE_CHECKING, Any, Self, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,13 +44,12 @@ if TYPE_CHECKING:
 _RESET_OPTIONS = ("scenario", "start")
 
 
-@dataclass(frozen=True)
-class StreamPosition:
+class StreamPosition(NamedTuple):
     """Where one environment is in its stream of episodes."""
 
     seed: int
     number: int
-    options: dict[str, Any] = field(default_factory=dict)
+    options: Mapping[str, Any]
     grid_steps: int = 0
     """Grid steps played in earlier episodes of the seed's stream."""
 
@@ -311,7 +310,7 @@ class TaskEnvironments:
         seed = int(seed)
         standing = self._standing(i)
         # Nobody can know the seed of the true episode, from which attacks follow. Later episodes are another stream's.
-        plan = replace(standing.plan, seed=seed, number=0)
+        plan = standing.plan._replace(seed=seed, number=0)
         return self.engine.imagine(i, seed).at(replace(standing, seed=seed, number=0, plan=plan, trail=None))
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:

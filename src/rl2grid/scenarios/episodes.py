@@ -5,7 +5,6 @@ All of it is a function of the seed and the episode's number, and of nothing els
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -30,8 +29,7 @@ MAX_REDRAWS = 100
 """After so many overloaded rows an episode starts in the first one of its month, which the generator keeps secure."""
 
 
-@dataclass(frozen=True)
-class EpisodePlan:
+class EpisodePlan(NamedTuple):
     """One episode, decided before it begins."""
 
     seed: int
