@@ -14,11 +14,11 @@ from rl2grid.mdp.actions import DO_NOTHING, StepAction, full_catalogue, level_ca
 from rl2grid.mdp.rewards import PRESETS
 from rl2grid.powerflow.flow_lanes import LOST
 from rl2grid.powerflow.lane_flow import DONE, FAILED
-from rl2grid.scenarios.episodes import plan_episode
+from rl2grid.scenarios.episodes import EpisodePlan, plan_episode
 from rl2grid.structures import Role, fields_of
 
 N = 21
-"""Rows: more than are played at the same time, and no multiple of the lanes."""
+"""Rows: more than are played at the same time with a heuristic, and no multiple of the lanes."""
 STEPS = 40
 
 
@@ -30,12 +30,21 @@ class Played:
         engine = NativeEngine(self.grid, N)
         self.transitions = NativeTransitions(engine, heuristic, "T", PRESETS["default"], 1.0)
         self.environments = engine.environments
-        for i in range(N):
-            self.begin(i, 0)
         self.lane_states: set[int] = set()
+        self.begin_all()
+
+    def begin_all(self) -> None:
+        for i in range(N):
+            self.transitions.engine.prepare(i, self.plan(i, 0))
+        rows = np.arange(N)
+        for part in [rows] if self.together else np.split(rows, N):
+            self.transitions.begin_rows(part, 1)
 
     def begin(self, i: int, number: int) -> None:
-        self.transitions.reset(i, plan_episode(self.grid, "bundled", i, number, start=24 * i))
+        self.transitions.reset(i, self.plan(i, number))
+
+    def plan(self, i: int, number: int) -> EpisodePlan:
+        return plan_episode(self.grid, "bundled", i, number, start=24 * i)
 
     def step(self, actions: list) -> None:
         commands = commands_of(self.grid, actions)
@@ -110,6 +119,15 @@ def test_rows_that_differ_in_their_open_lines_alone_are_solved_side_by_side(grid
     assert DONE in both[0].lane_states
     topologies = environments.flow.topo_vect[environments.lanes.row[environments.lanes.state == DONE]]
     assert len(np.unique(topologies, axis=0)) > 1, "lanes of the last step had different topologies"
+
+
+@pytest.mark.parametrize("grid_id", ["bus14", "bus36-MO-v0", "bus118-MOB-v1"])
+def test_a_row_that_begins_does_not_depend_on_its_company(grid_id):
+    both = [Played(grid_id, None, together) for together in (True, False)]
+    used = [played.environments.union.exists.any() for played in both]
+    assert used == [True, False], "flows were solved side by side"
+    assert DONE in both[0].environments.lanes.state
+    assert_kept_the_same(both, -1)
 
 
 def assert_kept_the_same(both: list[Played], step: int) -> None:
