@@ -179,7 +179,7 @@ def test_only_drawn_starts_of_generated_months_are_drawn_again(monkeypatch) -> N
 def test_an_episode_of_a_given_length_fits_where_it_starts() -> None:
     for seed in range(20):
         default, week = (plan_episode(BUS14, "train", seed, 1, episode_length=length) for length in (None, 2016))
-        assert week == replace(default, n_steps=2016)
+        assert week == default._replace(n_steps=2016)
     assert plan_episode(BUS14, "bundled", 0, 0, episode_length=575).n_steps == 575
     assert admissible_starts(575, 500) == 76
 
