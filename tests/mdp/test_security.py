@@ -12,7 +12,7 @@ from rl2grid.agents.dc_flow import buses, dc_point, is_connected, outage_factors
 from rl2grid.engines.native.what_if import WhatIf, snapshot_of
 from rl2grid.grids import load_grid
 from rl2grid.handles import AsOpened
-from rl2grid.mdp.heuristics import is_safe
+from rl2grid.mdp.heuristics import is_at_rest, is_safe
 from rl2grid.mdp.security import Security, is_expected, is_secure, loading_after_loss, new_security
 from rl2grid.mdp.state import GridState
 from rl2grid.powerflow.model import load_network
@@ -146,6 +146,26 @@ def test_without_attacks_only_announced_outages_are_expected():
 def test_a_grid_on_which_nothing_can_be_lost_is_secure(calm):
     grid = load_grid("bus118-M")
     assert is_secure(AsOpened[Security]()(may_be_lost("bus118-M")), *2 * (AsOpened[GridState]()(calm(grid)), 0))
+
+
+def test_the_agent_decides_until_units_are_back_at_rest():
+    """Where the grid would bear every loss as well; that engines agree is compared elsewhere."""
+    env = gymnasium.make("rl2grid/bus36-MO-v0-R-v0", heuristic="secure", disable_env_checker=True).unwrapped
+    opened, row = AsOpened[Security]()(may_be_lost("bus36-MO-v0")), (AsOpened[GridState]()(env.state), 0)
+    shift, asked_by_dispatch, longest = np.zeros(env.action_space.shape, np.float32), 0, 0
+    shift[0] = 1.0
+    for seed in range(4):
+        env.reset(seed=seed)
+        for action in (shift, *[0 * shift] * 150, -shift, *[0 * shift] * 150):
+            _, _, terminated, truncated, info = env.step(action)
+            if terminated or truncated:
+                break
+            at_ease = is_safe(*row) and is_secure(opened, *row, *row)
+            assert not (at_ease and is_at_rest(*row))
+            asked_by_dispatch += at_ease
+            longest = max(longest, info["n_steps"])
+    assert asked_by_dispatch > 0
+    assert longest > 10, "at rest nobody is asked for long"
 
 
 def test_the_agent_decides_while_a_loss_would_overload_a_line():

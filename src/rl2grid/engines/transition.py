@@ -19,6 +19,7 @@ from rl2grid.mdp.features import changes_topology
 from rl2grid.mdp.heuristics import (
     candidate_action,
     careful_candidate,
+    is_at_rest,
     is_careful_enough,
     is_safe,
     reconnect_action,
@@ -124,7 +125,9 @@ class Transitions:
 
     def _asks(self, i: int) -> bool:
         """Whether the agent decides although the grid is safe, where the heuristic has nothing to do."""
-        return self.heuristic == "secure" and not self._is_secure(i, self.opened_state, i)
+        if self.heuristic != "secure":
+            return False
+        return not (is_at_rest(self.opened_state, i) and self._is_secure(i, self.opened_state, i))
 
     def expects_loss(self, i: int, k: int) -> bool:
         """Whether the line of contingency ``k`` of :attr:`security` may be lost soon in row ``i``."""

@@ -10,6 +10,7 @@ from typing import Any
 from rl2grid.agents.agent import RevisedAgent
 from rl2grid.agents.foresight import Foresight
 from rl2grid.algorithms.pretrained import is_pretrained, pretrained
+from rl2grid.engines import INJECTION_RULES
 from rl2grid.envs.tasks import Task, find_task, short_id
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import make_agent
@@ -181,6 +182,8 @@ def _untrained(agent: str, task: Task, heuristic: str | None, months: int | None
     configuration["test"] = tested_months(task, months)
     if isinstance(made, RevisedAgent) and task.kind in made.rules:
         configuration["rules"] = made.rules[task.kind]
+    if task.injects and heuristic is not None and heuristic in INJECTION_RULES:
+        configuration["heuristic_rules"] = INJECTION_RULES[heuristic]
     return Subject(configuration, agent, task, heuristic, {})
 
 

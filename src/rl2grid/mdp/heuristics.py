@@ -23,6 +23,9 @@ SAFE_RHO = np.float32(0.95)
 CAREFUL_RHO = np.float32(0.95)
 """Careful plays what keeps every line loaded less, by the forecast for the next step."""
 
+LEAST_DISPATCH = np.float32(0.01)
+"""MW; a unit that is shifted by less is at rest."""
+
 _NOTHING, _RECONNECT, _RESTORE = int(ActionKind.NOTHING), int(ActionKind.RECONNECT), int(ActionKind.RESTORE)
 
 
@@ -30,6 +33,12 @@ _NOTHING, _RECONNECT, _RESTORE = int(ActionKind.NOTHING), int(ActionKind.RECONNE
 def is_safe(state: GridState, i: int) -> bool:
     """Whether every line of row ``i`` is loaded less than 95%: the heuristic plays, not the agent."""
     return bool(np.all(state.rho[i] < SAFE_RHO))
+
+
+@jit
+def is_at_rest(state: GridState, i: int) -> bool:
+    """Whether every generator of row ``i`` produces what its series says: no agent has to bring it back."""
+    return bool(np.all(np.abs(state.actual_dispatch[i]) < LEAST_DISPATCH))
 
 
 @jit

@@ -85,6 +85,11 @@ class HashedTest:
         return int(self.configuration.get("rules", 1))
 
     @property
+    def heuristic_rules(self) -> int:
+        """Version of the rules of the heuristic beside an agent without training."""
+        return int(self.configuration.get("heuristic_rules", 1))
+
+    @property
     def player(self) -> str:
         """The agent, its network if no ``mlp``, features beside the paper's, of how many actions the what-if chose."""
         network = self.configuration.get("hyperparameters", {}).get("network", "mlp")

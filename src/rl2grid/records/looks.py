@@ -48,16 +48,20 @@ def earlier_choices(results: Mapping[str, HashedTest], method: tuple[Any, ...], 
 
 
 def latest_rules(results: Mapping[str, HashedTest]) -> dict[tuple[Any, ...], int]:
-    """By what latest rules an agent has had a test on a task, with any heuristic; for :func:`is_outdated`."""
+    """By what latest rules an agent has had a test on a task, with any heuristic, and by what latest ones of each.
+
+    For :func:`is_outdated`.
+    """
     latest: dict[tuple[Any, ...], int] = {}
     for one in results.values():
-        latest[_played_by(one)] = max(one.rules, latest.get(_played_by(one), one.rules))
+        for player, rules in _rules_of(one).items():
+            latest[player] = max(rules, latest.get(player, rules))
     return latest
 
 
 def is_outdated(result: HashedTest, latest: Mapping[tuple[Any, ...], int]) -> bool:
     """Whether an agent without training has had a test by later rules, of :func:`latest_rules`, than this one."""
-    return result.rules < latest[_played_by(result)]
+    return any(rules < latest[player] for player, rules in _rules_of(result).items())
 
 
 def by_present_rules(results: Mapping[str, HashedTest]) -> dict[str, HashedTest]:
@@ -79,8 +83,10 @@ def budget(result: HashedTest) -> tuple[tuple[str, Any], ...]:
     return tuple(sorted({"decisions": decisions, **result.training["identity"].get("budget", {})}.items()))
 
 
-def _played_by(result: HashedTest) -> tuple[Any, ...]:
-    return result.task, result.agent, result.months["split_version"]
+def _rules_of(result: HashedTest) -> dict[tuple[Any, ...], int]:
+    """The rules of the agent, and of the heuristic beside it."""
+    agent = result.task, result.agent, result.months["split_version"]
+    return {agent: result.rules, (*agent, result.heuristic): result.heuristic_rules}
 
 
 def _list_of(result: HashedTest) -> tuple[str, Any]:

@@ -21,6 +21,7 @@ from rl2grid.mdp.actions import ActionKind
 from rl2grid.mdp.heuristics import (
     candidate_action,
     careful_candidate,
+    is_at_rest,
     is_careful_enough,
     is_safe,
     reconnect_action,
@@ -239,7 +240,9 @@ def _order(
 @jit
 def _asks(state: GridState, i: int, heuristic: int, security: int) -> bool:
     """Whether the agent decides in row ``i``, where the grid is safe and the heuristic has nothing to do."""
-    return heuristic >= SECURE and not is_secure(open_security(security), state, i, state, i)
+    if heuristic < SECURE:
+        return False
+    return not (is_at_rest(state, i) and is_secure(open_security(security), state, i, state, i))
 
 
 @jit
