@@ -18,7 +18,7 @@ from rl2grid.analysis.ledger_bounds import headroom_table
 from rl2grid.analysis.ledger_overview import best_row, by_task, kind_of
 from rl2grid.envs.tasks import find_task, short_id
 from rl2grid.evaluation.protocol import evaluate
-from rl2grid.ledger.subjects import tested_months
+from rl2grid.ledger.subjects import heuristic_rules, tested_months
 from rl2grid.records.evaluations import identity_hash
 from rl2grid.records.ledger import HashedTest, add_test, hashed_test, read_ledger
 from rl2grid.scenarios.splits import TEST
@@ -45,6 +45,7 @@ def play(task_id: str, heuristic: str | None, months: int, attempts: int, folder
         "task": task.id,
         "heuristic": heuristic,
         "test": tested_months(task, months),
+        **heuristic_rules(task, heuristic),
     }
     digest = identity_hash(configuration)
     if digest in read_ledger(BOUNDS):

@@ -47,6 +47,13 @@ def test_an_agent_whose_rules_changed_says_so_where_they_did():
     assert "rules" not in find_subject("do-nothing@bus14-R").configuration
 
 
+def test_a_heuristic_whose_rules_changed_says_so_where_power_can_be_dispatched():
+    assert find_subject("do-nothing@bus14-R:secure").configuration["heuristic_rules"] == 2
+    assert find_subject("do-nothing@bus14-H0:secure").configuration["heuristic_rules"] == 2
+    for other in ("do-nothing@bus14-T0:secure", "do-nothing@bus14-R:recovery", "do-nothing@bus14-R"):
+        assert "heuristic_rules" not in find_subject(other).configuration
+
+
 def test_an_agent_without_training_is_named_with_its_task(played):
     subject = find_subject("random@bus14-T0:idle")
     who = {"agent": "random", "task": "rl2grid/bus14-T0-v0", "heuristic": "idle"}

@@ -6,7 +6,7 @@ from typing import Any
 
 from rl2grid.records.evaluations import identity_hash
 from rl2grid.records.ledger import HashedTest
-from rl2grid.records.looks import budget, earlier_choices, looks, method_of
+from rl2grid.records.looks import budget, earlier_choices, is_outdated, latest_rules, looks, method_of
 
 TASK = "rl2grid/bus14-T0-v0"
 
@@ -49,3 +49,16 @@ def test_what_came_after_another_choice_of_its_method_is_known():
 def test_a_budget_is_decisions_and_validations():
     assert budget(entry(1)) == (("decisions", 1000), ("evaluate_every", 250), ("validation_months", 20))
     assert budget(HashedTest({"agent": "greedy", "task": TASK, "heuristic": None}, {}, "", "", {}, {}, {}, {})) == ()
+
+
+def untrained(heuristic: str | None, **rules: int) -> HashedTest:
+    configuration = {"agent": "planner", "task": "rl2grid/bus14-R-v0", "heuristic": heuristic, **rules}
+    return HashedTest(configuration, {}, "", "", {}, {"split_version": "2"}, {}, {})
+
+
+def test_rules_of_an_agent_outdate_all_its_tests_and_those_of_a_heuristic_the_tests_with_it():
+    old, with_other, latest = untrained("secure"), untrained("recovery"), untrained("secure", heuristic_rules=2)
+    results = ledger(old, with_other, latest)
+    assert [is_outdated(one, latest_rules(results)) for one in (old, with_other, latest)] == [True, False, False]
+    results = ledger(old, with_other, latest, untrained("idle", rules=2))
+    assert all(is_outdated(one, latest_rules(results)) for one in (old, with_other, latest))

@@ -6,7 +6,8 @@ ENGINES: tuple[str, ...] = ("native", "reference")
 """Engines by name: ``native`` is ours, compiled; ``reference`` is Grid2Op with LightSim2Grid."""
 
 HEURISTICS: tuple[str, ...] = ("idle", "recovery", "careful", "secure")
-"""What may play while the grid is safe (``secure``: and bears losses); without one, the agent decides every step."""
+"""What may play while the grid is safe (``secure``: and bears losses, and units are at rest); without one, the agent
+decides every step."""
 
 INJECTION_RULES: Mapping[str, int] = {"secure": 2}
 """Version of a heuristic's rules on redispatching and joint tasks, where it is not the first."""

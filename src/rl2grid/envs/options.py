@@ -64,7 +64,7 @@ class TaskOptions:
     """``"native"``: ours, compiled; ``"reference"``: Grid2Op with LightSim2Grid."""
     heuristic: str | None = field(default=None, metadata=_one_of(None, *HEURISTICS))
     """What plays while the grid is safe: ``"idle"``, ``"recovery"``, ``"careful"``; ``"secure"``: while it is safe and
-    would bear the loss of any line that may be lost; None: the agent always decides."""
+    would bear the loss of any line that may be lost, and no unit is dispatched; None: the agent always decides."""
     reward: str | tuple[float, float, float] | Callable[..., Any] = field(
         default="default",
         metadata={"flag": "default, paper or released, or the weights of the three components, such as 1,0.5,0"},

@@ -154,6 +154,13 @@ def tested_months(task: Task, months: int | None) -> dict[str, Any]:
     return {"split_version": split_version(task.grid_id, TEST), "months": number}
 
 
+def heuristic_rules(task: Task, heuristic: str | None) -> dict[str, int]:
+    """An entry of a configuration: the version of a heuristic's rules; empty where it is the first."""
+    if heuristic is None or not task.injects or heuristic not in INJECTION_RULES:
+        return {}
+    return {"heuristic_rules": INJECTION_RULES[heuristic]}
+
+
 _LATER = ("episode_length", "operator_features")
 """Keywords that came after the first results."""
 
@@ -182,8 +189,7 @@ def _untrained(agent: str, task: Task, heuristic: str | None, months: int | None
     configuration["test"] = tested_months(task, months)
     if isinstance(made, RevisedAgent) and task.kind in made.rules:
         configuration["rules"] = made.rules[task.kind]
-    if task.injects and heuristic is not None and heuristic in INJECTION_RULES:
-        configuration["heuristic_rules"] = INJECTION_RULES[heuristic]
+    configuration |= heuristic_rules(task, heuristic)
     return Subject(configuration, agent, task, heuristic, {})
 
 
