@@ -29,9 +29,9 @@ LEGEND = (
     "on the same months; p: that there is none, Holm's correction over the rows of the task. Completed and safe: "
     "shares of months, with Wilson's intervals. Marks: a, entered after other configurations of the same agent and "
     "heuristic had had their test on these months (their number); b, another budget (decisions, validations, months of "
-    "each) than most trained rows of the task with that heuristic; r, an agent without training by earlier rules than "
-    "another row of it; s, a run that had been evaluated on test months "
-    "before; t, trained under a heuristic with targets of an earlier version. Decisions of a training that began from "
+    "each) than most trained rows of the task with that heuristic; r, an agent without training, or the heuristic "
+    "beside it, by earlier rules than another row of both; s, a run that had been evaluated on test months before; "
+    "t, trained under a heuristic with targets of an earlier version. Decisions of a training that began from "
     "another's policy are its own; imitation's are those of its labels, each as often as it was learned from."
 )
 _HEADINGS = (
