@@ -44,7 +44,7 @@ _DICTS = {
     reports.EPISODE_COSTS: ("episode_costs", COSTS),
     reports.EPISODE_SCORES: ("scores", SCORES),
 }
-"""By the line of the first entry: the key, and the names of the entries. Behind the numbers, with nothing between."""
+"""By the line of the first entry: the key, and the names of the entries."""
 
 
 class _Blank(NamedTuple):
@@ -67,11 +67,13 @@ class InfoForm:
     """
 
     def __init__(self, words: Sequence[str], tells_discounted: bool, n: int) -> None:
-        self._words = list(words)
-        self._counts, self._flags, self._numbers = (
-            [lines[line] for line in range(len(lines))] for lines in (_COUNTS, _FLAGS, _NUMBERS)
-        )
-        self._dicts = [_DICTS[first] for first in sorted(_DICTS)]
+        names = [_COUNTS, _FLAGS, _NUMBERS]
+        self._keys = [*words, *(lines[line] for lines in names for line in range(len(lines))), "attacked_lines"]
+        self._dicts = [
+            (key, slice(first, first + len(entries)), entries, _beside_masks(entries))
+            for first, (key, entries) in _DICTS.items()
+        ]
+        self._all = _beside_masks((*self._keys, *(key for key, *_ in self._dicts)))
         self._tells_discounted = tells_discounted
         everybody = np.ones(n, np.bool_)
         everybody.flags.writeable = False
@@ -87,32 +89,21 @@ class InfoForm:
                 all steps share, cannot be written.
         """
         blank = self._blank if told is None else self._blank_of(told)
-        infos, numbers = blank.infos.copy(), iter(report.numbers)
+        infos, numbers = blank.infos.copy(), list(report.numbers)
+        values = (*words, *report.counts, *report.flags, *numbers[: len(_NUMBERS)], report.attacked)
         # Assigned one by one: for so few that is faster than to update.
-        for key, word in zip(self._words, words, strict=True):
-            infos[key] = word
-        for key, count in zip(self._counts, report.counts, strict=True):
-            infos[key] = count
-        for key, flag in zip(self._flags, report.flags, strict=True):
-            infos[key] = flag
-        for key in self._numbers:
-            infos[key] = next(numbers)
-        infos["attacked_lines"] = report.attacked
-        for (key, entries), masks in zip(self._dicts, blank.dicts, strict=True):
+        for key, value in zip(self._keys, values, strict=True):
+            infos[key] = value
+        for (key, lines, entries, _), masks in zip(self._dicts, blank.dicts, strict=True):
             infos[key] = entries_of = masks.copy()
-            for entry in entries:
-                entries_of[entry] = next(numbers)
+            for entry, value in zip(entries, numbers[lines], strict=True):
+                entries_of[entry] = value
         if not self._tells_discounted:
             del infos["discounted_reward"], infos["_discounted_reward"]
         return infos
 
     def _blank_of(self, told: Flags) -> _Blank:
-        keys = [*self._words, *self._counts, *self._flags, *self._numbers, "attacked_lines"]
-        keys += [key for key, _ in self._dicts]
-        return _Blank(
-            dict.fromkeys(_beside_masks(keys), told),
-            [dict.fromkeys(_beside_masks(entries), told) for _, entries in self._dicts],
-        )
+        return _Blank(dict.fromkeys(self._all, told), [dict.fromkeys(names, told) for *_, names in self._dicts])
 
 
 def _beside_masks(keys: Sequence[str]) -> list[str]:

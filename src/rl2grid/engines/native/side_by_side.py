@@ -14,8 +14,8 @@ from rl2grid.engines.native.step import (
     begin_reset,
     begin_step,
     dispatch_or_lose,
-    end_reset,
     end_step,
+    finish_reset,
     set_scene,
 )
 from rl2grid.powerflow.ac import CONVERGED, DIVERGED, PREPARED
@@ -56,7 +56,7 @@ def reset_side_by_side(environments: Environments, rows: I64, n: int, status: I6
         status[k] = _begin_reset(environments, rows[k])
     _settle(environments, rows, n, status, False)
     for k in range(n):
-        end_reset(environments, rows[k], status[k] == SETTLED)
+        finish_reset(environments, rows[k], status[k] == SETTLED)
 
 
 @jit

@@ -43,7 +43,7 @@ def reset_row(environments: Environments, i: int) -> int:
     Grid2Op plays a step for that: nobody acts, overloads are not counted, but lines above the hard limit trip.
     """
     begin_reset(environments, i)
-    return end_reset(environments, i, flow_with_cascade(environments, i, False))
+    return finish_reset(environments, i, flow_with_cascade(environments, i, False))
 
 
 @jit
@@ -68,7 +68,7 @@ def begin_reset(environments: Environments, i: int) -> None:
 
 
 @jit
-def end_reset(environments: Environments, i: int, has_flow: bool) -> int:
+def finish_reset(environments: Environments, i: int, has_flow: bool) -> int:
     """:func:`reset_row` from after the power flow and the cascade, which found a flow or not."""
     state, hidden = environments.state, environments.hidden
     if not has_flow:
