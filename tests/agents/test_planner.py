@@ -114,6 +114,24 @@ def test_prevention_shifts_power_while_the_grid_is_safe():
     assert shifted > 2 * float(np.abs(other.unwrapped.state.actual_dispatch[0]).sum())
 
 
+def test_power_is_shifted_before_announced_maintenance_where_nobody_attacks():
+    """A line whose loss would overload another is to be taken in two hours; without prevention nothing is asked for."""
+    shifted = []
+    for without in ([], ["prevention"]):
+        agent, env = begun("bus36-M-R", 220, without=without)
+        base = env.unwrapped
+        point = snapshot_of(base.engine, 0)
+        worst = WhatIf(base.grid).outages(point, np.arange(base.grid.n_line, dtype=np.int32)).worst_loading
+        assert float(base.state.rho[0].max()) < 0.9
+        line = int(np.flatnonzero((worst > 1.05) & (worst < 1.3))[0])
+        observed = base.restore(base.save())
+        base.state.time_next_maintenance[0][line], base.state.duration_next_maintenance[0][line] = 24, 96
+        action = agent.act(*observed)
+        shifted.append(float(np.abs(action).max()))
+    assert shifted[0] > 0.1
+    assert shifted[1] == 0.0
+
+
 def test_topology_is_made_ready_for_announced_maintenance_while_the_grid_is_safe():
     """Twelve steps before: the worst loading without the line is less after what it plays than after nothing."""
     agent, env = begun("bus118-M-T1", 385, seed=1)

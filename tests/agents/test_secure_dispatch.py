@@ -10,7 +10,8 @@ import rl2grid  # noqa: F401  (registers the tasks)
 from rl2grid.agents.contingencies import NONE, Contingencies, danger
 from rl2grid.agents.dc_flow import buses, dc_flow, dc_point, outage_factors, sensitivities
 from rl2grid.agents.dispatch import controls
-from rl2grid.agents.secure_dispatch import SecureDispatch
+from rl2grid.agents.secure_dispatch import SecureDispatch, _Case, _overload_rows
+from rl2grid.agents.trend import LATER, TREND_SHARE
 from rl2grid.engines.native.what_if import WhatIf, forecast_of, snapshot_of
 from rl2grid.mdp.actions import continuous_layout
 from rl2grid.powerflow.model import load_network
@@ -150,9 +151,9 @@ def test_a_plan_counts_only_what_the_forecast_says_of_the_next_step():
 def rising(env, series, megawatts):
     """The series, where by the trend one generator far from the balancing one produces so much more in a step."""
     layout = continuous_layout(env.grid)
-    trend = np.zeros(env.grid.dim_topo)
-    trend[env.grid.gen_pos_topo_vect[layout.curtail[0]]] = megawatts
-    return series._replace(trend=trend)
+    change = np.zeros(env.grid.dim_topo)
+    change[env.grid.gen_pos_topo_vect[layout.curtail[0]]] = LATER * TREND_SHARE * megawatts
+    return series._replace(half_hour=change, hour=2 * change)
 
 
 def test_a_line_that_will_be_overloaded_by_the_trend_is_relieved_before():
@@ -170,6 +171,39 @@ def test_a_line_that_will_be_overloaded_by_the_trend_is_relieved_before():
     worst = int(np.argmax(np.abs(before[1].share)))
     change = before[1].effect[worst] @ (planned - controls(env.state, env.grid).now)
     assert np.sign(before[1].share[worst]) * change < 0  # what will flow too much is made less
+
+
+def test_what_an_outage_would_overload_an_hour_later_is_relieved_before():
+    """The loss of no line leaves an overload now, nor does the trend without one within half an hour."""
+    env = standing("bus36-MO-v0-R", opponent=False)
+    dispatch, what_if = dispatch_of(env), WhatIf(env.grid)
+    point, series = snapshot_of(env.engine, 0), series_of(env, dispatch)
+    lines = np.array([20], np.int32)
+    contingencies = Contingencies(lines, np.ones(1))
+    assert what_if.outages(point, lines).worst_loading[0] < 0.9
+    assert dispatch.plan(env.state, point, series, contingencies, everything=False) is None
+    later = rising(env, series, 12.0)
+    assert dispatch.plan(env.state, point, later, NONE, everything=False) is None
+    planned = dispatch.plan(env.state, point, later, contingencies, everything=False)
+    assert planned is not None
+    cases, needed = dispatch._cases(env.state, point, later, contingencies)
+    assert needed
+    worst = int(np.argmax(np.abs(cases[-1].share)))
+    change = cases[-1].effect[worst] @ (planned - controls(env.state, env.grid).now)
+    assert np.sign(cases[-1].share[worst]) * change < 0
+
+
+def test_beyond_its_limit_a_line_costs_more():
+    """What the rows of a case add up to is the price of its loadings, whatever is injected."""
+    rng = np.random.default_rng(0)
+    prices = (0.9, 20.0), (0.98, 200.0)
+    share, effect, now = np.array([0.95, -1.1, 0.3]), rng.normal(0.0, 0.01, (3, 4)), rng.normal(0.0, 10.0, 4)
+    rows, bound, weight = _overload_rows(_Case(prices, share, effect), now)
+    for _ in range(20):
+        injected = now + rng.normal(0.0, 3.0, 4)
+        loading = (np.sign(share) * (share + effect @ (injected - now)))[:2]  # the third line is not watched
+        expected = sum(price * np.maximum(loading - above, 0.0).sum() for above, price in prices)
+        np.testing.assert_allclose(weight @ np.maximum(rows @ injected - bound, 0.0), expected, atol=1e-9)
 
 
 def test_what_curtailment_holds_makes_the_next_step_count():

@@ -39,7 +39,7 @@ def played(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
 
 
 def test_an_agent_whose_rules_changed_says_so_where_they_did():
-    assert find_subject("planner@bus14-R:recovery").configuration["rules"] == 2
+    assert find_subject("planner@bus14-R:recovery").configuration["rules"] == 3
     assert find_subject("planner@bus14-H0").digest != identity_hash(
         {name: value for name, value in find_subject("planner@bus14-H0").configuration.items() if name != "rules"}
     )

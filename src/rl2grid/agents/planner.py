@@ -86,8 +86,8 @@ class Planner:
 
     While the grid is safe, it closes lines, brings substations back where that is safe and makes no outage worse, and
     makes ready for half an hour later by the trend and for announced maintenance: by topology where there is nothing
-    else, or it shifts power so that no line is overloaded then and, where there is an opponent, after no
-    attack or announced outage (:class:`~rl2grid.agents.secure_dispatch.SecureDispatch`). When it is not safe, it looks
+    else, or it shifts power so that no line is overloaded then, nor after an attack or an announced outage, now
+    or an hour later (:class:`~rl2grid.agents.secure_dispatch.SecureDispatch`). When it is not safe, it looks
     for the sequence of topology actions that makes it so before protections trip a line
     (:class:`~rl2grid.agents.topology_search.TopologySearch`), and dispatches against what is left; where both can be
     done, dispatch comes first. It knows forecasts, announced maintenance and which lines the opponent may attack, not
@@ -102,7 +102,7 @@ class Planner:
     """
 
     kinds = ("T", "R", "H")
-    rules: ClassVar[Mapping[str, int]] = {"T": 2, "R": 2, "H": 2}
+    rules: ClassVar[Mapping[str, int]] = {"T": 2, "R": 3, "H": 3}
 
     def __init__(self, without: Collection[str] = (), seconds: float | None = None) -> None:
         if isinstance(without, str) or not isinstance(without, Collection):
@@ -346,7 +346,7 @@ class Planner:
         foretold = self._foretold_at(state)
         if foretold is not None:
             return with_change(series, foretold.injection - undispatched(state, self._grid))
-        return series._replace(trend=np.zeros_like(series.trend)) if "trend" in self._without else series
+        return with_change(series, np.zeros(self._grid.dim_topo)) if "trend" in self._without else series
 
     def _change_per_step(self) -> F64:
         """MW more that every element injects in a step, by the trend, float64 [topo]."""
@@ -365,8 +365,7 @@ class Planner:
         if topology != NOTHING:
             assert self._search is not None
             point = self._search.after(point, topology)
-        prevents = bool(self._grid.opponent.areas) and "prevention" not in self._without
-        contingencies = expected(self._grid, moment.state) if prevents else NONE
+        contingencies = NONE if "prevention" in self._without else expected(self._grid, moment.state)
         foretold, everything = self._foretold_at(moment.state), not moment.safe
         if foretold is not None:
             contingencies, everything = with_certain(contingencies, foretold.lines), True

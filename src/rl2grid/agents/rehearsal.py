@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 import gymnasium
 
@@ -19,6 +19,7 @@ from rl2grid.agents.agent import (
     topology_part,
 )
 from rl2grid.agents.courses import Averted, Course, Courses, Guided, Reach
+from rl2grid.agents.planner import Planner
 from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.errors import UsageError
 from rl2grid.handles import AsOpened
@@ -56,6 +57,7 @@ class Rehearsal(Guided):
 
     name = "rehearsal"
     kinds = ("T", "H")
+    rules: ClassVar[Mapping[str, int]] = {"H": Planner.rules["H"]}  # of the guide, which injects
 
     def __init__(
         self,

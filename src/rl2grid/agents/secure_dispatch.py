@@ -33,18 +33,23 @@ from rl2grid.powerflow.batch import Snapshot
 from rl2grid.powerflow.model import Network
 
 NORMAL_BOUND = 0.90
-"""Loading that is wanted at most of every line as the grid is."""
+"""Loading that is wanted at most of every line as the grid is, and half an hour later."""
 OUTAGE_BOUND = 0.95
-"""The same after the loss of a line."""
+"""The same after the loss of a line, now or an hour later."""
 _SCREEN = 0.90
 """Worst loading after an outage from which on it is a case of the programme."""
 _CASES = 8
 """Outages in a programme at most."""
 _WATCHED = 0.85
 """Loading from which on a line of a case has a row."""
-_NORMAL_WEIGHT, _LATER_WEIGHT = 20.0, 5.0
-"""Price of the overload of a line, as a share of its limit, as the grid is, and as it will be by the trend; after an
-outage: the outage's weight."""
+_NORMAL_PRICES = (NORMAL_BOUND, 20.0), (0.98, 200.0)
+_LATER_PRICES = (NORMAL_BOUND, 5.0), (0.98, 20.0)
+_OUTAGE_PRICES = (OUTAGE_BOUND, 1.0), (1.0, 5.0)
+"""Loadings, and what a line costs beyond each, as a share of its limit: as the grid is, half an hour later by the
+trend, and after an outage, times the weight of that. Beyond its limit a line costs much more than what is wanted
+besides, or two lines of which one would trip are loaded alike."""
+_OUTAGE_LATER = 0.5
+"""What an outage counts an hour later, beside one now."""
 _PRICE = 2e-4
 """Of a MW of the cheapest control away from rest."""
 _LIMIT_PRICE = 1.0
@@ -77,8 +82,7 @@ _NO_ACTION = ActionCatalogue(
 
 
 class _Case(NamedTuple):
-    weight: float
-    bound: float
+    prices: tuple[tuple[float, float], ...]  # loadings, and what a line costs beyond each
     share: F64  # [line] DC flow over limit, with its sign
     effect: F64  # [line, control] change of that per MW
 
@@ -90,6 +94,7 @@ class _Look(NamedTuple):
     bus: I32  # [topo]
     table: F64  # [line, bus] sensitivities
     flow: F64  # [line] MW by the DC flow
+    change: F64  # [line] MW more an hour later, by the trend
     effect: F64  # [line, control] MW more on a line per MW injected
     worst: float  # loading by the AC flow
     present: _Case
@@ -101,12 +106,31 @@ class _Look(NamedTuple):
         return max(self.worst, float(np.abs(self.later.share).max()))
 
 
+class _Outage(NamedTuple):
+    """The loss of a line."""
+
+    line: int
+    weight: float
+    factor: F64  # [line] MW more on each line per MW that the lost one carried
+    limit: F64  # [line] MW
+    flow: F64  # [line] MW after it
+    flow_later: F64  # [line] the same an hour later
+    worst: float  # loading after it by the AC flow
+    worst_later: float  # loading after it an hour later by the DC flow
+
+    @property
+    def urgency(self) -> float:
+        """By which outages are chosen."""
+        return self.weight * max(self.worst, self.worst_later)
+
+
 class Series(NamedTuple):
     """Production of the redispatchable generators before any dispatch, and how all injections change."""
 
     now: F64  # [gen] MW
     ahead: F64  # [horizon, gen] MW
-    trend: F64  # [topo] MW more injected by each element in a step, by the last half hour
+    half_hour: F64  # [topo] MW that each element will inject more in half an hour, by the trend of the last
+    hour: F64  # [topo] the same in an hour
 
 
 class SecureDispatch:
@@ -145,7 +169,8 @@ class SecureDispatch:
             known[steps - 1] if steps <= len(known) else np.clip(known[-1] + (steps - len(known)) * trend, least, most)
             for steps in _HORIZONS
         ]
-        return Series(now, np.array(ahead), change_per_step)
+        half_hour = LATER * TREND_SHARE * change_per_step
+        return Series(now, np.array(ahead), half_hour, 2 * half_hour)
 
     def is_in_use(self, state: GridState) -> bool:
         """Whether generators are dispatched by more than a trifle."""
@@ -298,14 +323,17 @@ class SecureDispatch:
             return None
         bus, flow = buses(self._grid, dc.busbar), flow_by(table, self._grid, dc)
         effect, limit = table[:, bus[self._positions]], _limits(flow, rho[0], dc)
-        present = _case(_NORMAL_WEIGHT, NORMAL_BOUND, flow, effect, limit)
-        change = flow_by(table, self._grid, dc._replace(injection=self._to_come(state, series)))
-        later = _case(_LATER_WEIGHT, NORMAL_BOUND, flow + change, effect, limit)
-        return _Look(dc, bus, table, flow, effect, float(rho.max()), present, later)
+        half_hour, hour = (
+            flow_by(table, self._grid, dc._replace(injection=self._followed(state, change)))
+            for change in (series.half_hour, series.hour)
+        )
+        present = _case(_NORMAL_PRICES, flow, effect, limit)
+        later = _case(_LATER_PRICES, flow + half_hour, effect, limit)
+        return _Look(dc, bus, table, flow, hour, effect, float(rho.max()), present, later)
 
-    def _to_come(self, state: GridState, series: Series) -> F64:
-        """MW more that every element will inject some steps later; what is curtailed does not follow its series."""
-        change = LATER * TREND_SHARE * series.trend
+    def _followed(self, state: GridState, change: F64) -> F64:
+        """Of a change of what all elements inject, MW: what is curtailed does not follow its series."""
+        change = change.copy()
         curtailed = state.gen_renewable & (state.gen_p_before_curtail[0] - state.gen_p[0] > _AWAY)
         change[self._grid.gen_pos_topo_vect[curtailed]] = 0.0
         change[self._grid.gen_pos_topo_vect[self._grid.slack_gen]] -= change.sum()
@@ -328,21 +356,21 @@ class SecureDispatch:
             return []
         rho = np.zeros((len(lines), grid.n_line), np.float32)
         outcomes = self._what_if.outages(point, lines, rho)
-        worst = np.where(np.isfinite(outcomes.worst_loading), outcomes.worst_loading, 0.0).astype(np.float64)
-        matters = ~outcomes.was_open & (outcomes.verdict == 0) & (worst >= _SCREEN)
-        order = np.argsort(-np.where(matters, worst * contingencies.weight, -1.0), kind="stable")[:_CASES]
         found = []
-        for k in order[matters[order]].tolist():
+        for k in np.flatnonzero(~outcomes.was_open & (outcomes.verdict == 0)).tolist():
             line = int(lines[k])
             factor = outage_factors(grid, look.table, look.bus, line)
             if factor is None:
                 continue
             after = look.flow + factor * look.flow[line]
-            effect_after = look.effect + np.outer(factor, look.effect[line])
             limit = _limits(after, rho[k], look.dc)
-            case = _case(float(contingencies.weight[k]), OUTAGE_BOUND, after, effect_after, limit)
-            found.append((float(worst[k]), case))
-        return found
+            then = after + look.change + factor * look.change[line]
+            worst, worst_then = float(outcomes.worst_loading[k]), float(np.abs(then / limit).max())
+            weight = float(contingencies.weight[k])
+            if max(worst, worst_then) >= _SCREEN:
+                found.append(_Outage(line, weight, factor, limit, after, then, worst, worst_then))
+        found.sort(key=lambda outage: -outage.urgency)
+        return [case for outage in found[:_CASES] for case in _cases_after(outage, look)]
 
     def _solve(self, state: GridState, control: Control, cases: list[_Case], series: Series) -> F64 | None:
         n_gen = len(self._layout.redispatch)
@@ -401,12 +429,26 @@ class SecureDispatch:
 
 def with_change(series: Series, change: F64) -> Series:
     """The series where not the trend but somebody who knows says how all injections will have changed, MW [topo]."""
-    return series._replace(trend=change / (LATER * TREND_SHARE))
+    return series._replace(half_hour=change, hour=change)
 
 
-def _case(weight: float, bound: float, flow: F64, effect: F64, limit: F64) -> _Case:
+def _case(prices: tuple[tuple[float, float], ...], flow: F64, effect: F64, limit: F64) -> _Case:
     """A case in shares of the limits."""
-    return _Case(weight, bound, flow / limit, effect / limit[:, None])
+    return _Case(prices, flow / limit, effect / limit[:, None])
+
+
+def _cases_after(outage: _Outage, look: _Look) -> list[tuple[float, _Case]]:
+    """The worst loading after an outage and its case, now and an hour later, each where it matters."""
+    effect = look.effect + np.outer(outage.factor, look.effect[outage.line])
+    found = []
+    for worst, flow, weight in (
+        (outage.worst, outage.flow, outage.weight),
+        (outage.worst_later, outage.flow_later, _OUTAGE_LATER * outage.weight),
+    ):
+        if worst >= _SCREEN:
+            prices = tuple((bound, weight * price) for bound, price in _OUTAGE_PRICES)
+            found.append((worst, _case(prices, flow, effect, outage.limit)))
+    return found
 
 
 def _limits(flow: F64, rho: NDArray[np.float32], dc: DcPoint) -> F64:
@@ -419,8 +461,11 @@ def _limits(flow: F64, rho: NDArray[np.float32], dc: DcPoint) -> F64:
 
 def _overload_rows(case: _Case, now: F64) -> tuple[F64, F64, F64]:
     """``effect @ x <= bound + overload`` of the lines that matter: effect [row, control], bound and weight [row]."""
-    (watched,) = np.nonzero(np.abs(case.share) > min(_WATCHED, case.bound - 0.03))
+    lowest = min(bound for bound, _ in case.prices)
+    (watched,) = np.nonzero(np.abs(case.share) > min(_WATCHED, lowest - 0.03))
     sign = np.sign(case.share[watched])
     effect = case.effect[watched] * sign[:, None]
     unchanged = (case.share[watched] - case.effect[watched] @ now) * sign
-    return effect, case.bound - unchanged, np.full(len(watched), case.weight)
+    bounds = np.concatenate([bound - unchanged for bound, _ in case.prices])
+    weights = np.repeat([price for _, price in case.prices], len(watched))
+    return np.tile(effect, (len(case.prices), 1)), bounds, weights
