@@ -21,7 +21,9 @@ TOLERANCE = {"a_or": 1e-3, "gen_theta": 1e-4, "load_theta": 1e-4, "rho": 1e-5}
 """Absolute; A, degrees. Currents of thousands of A are float32, whose resolution is 2e-4 A there."""
 
 
-@pytest.fixture(scope="module", params=["rte_case5_example", "rte_case118_example"])
+@pytest.fixture(
+    scope="module", params=["rte_case5_example", pytest.param("rte_case118_example", marks=pytest.mark.slow)]
+)
 def environment(request, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RL2GRID_DATA", str(tmp_path_factory.mktemp("data")))
