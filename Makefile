@@ -11,7 +11,7 @@ WORKERS ?= 2
 # The theme announces its successor at every build.
 export NO_MKDOCS_2_WARNING := 1
 
-.PHONY: help demo docs test quick-tests test-slow lint release clean
+.PHONY: help demo docs test test-slow lint release clean
 
 help:
 	@echo "make demo       train DQN on bus14, evaluate it, write reports/demo (a few minutes)"
@@ -47,11 +47,7 @@ lint: $(VENV)/.installed
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports
 
-# Side by side: mypy keeps one core busy for half a minute.
-test: $(VENV)/.installed
-	@$(MAKE) --no-print-directory --jobs=2 lint quick-tests
-
-quick-tests: $(VENV)/.installed
+test: lint
 	@echo "== Tests"
 	@$(BIN)/python -m pytest -m "not slow" -n $(WORKERS) --dist worksteal
 
