@@ -106,7 +106,7 @@ def test_a_vector_tells_what_single_environments_tell(heuristic: str | None, eng
     expected = [env.reset(seed=5 + k)[0] for k, env in enumerate(singles)]
     np.testing.assert_array_equal(observations, expected)
     rng = np.random.default_rng(0)
-    for _ in range(40 if engine == "native" else 15):
+    for _ in range(40):
         actions = [random_action(env, rng) for env in singles]
         observations, _, terminated, _, infos = envs.step(np.array(actions))
         for k, env in enumerate(singles):

@@ -324,14 +324,14 @@ class SecureDispatch:
         bus, flow = buses(self._grid, dc.busbar), flow_by(table, self._grid, dc)
         effect, limit = table[:, bus[self._positions]], _limits(flow, rho[0], dc)
         half_hour, hour = (
-            flow_by(table, self._grid, dc._replace(injection=self._followed(state, change)))
+            flow_by(table, self._grid, dc._replace(injection=self._without_curtailed(state, change)))
             for change in (series.half_hour, series.hour)
         )
         present = _case(_NORMAL_PRICES, flow, effect, limit)
         later = _case(_LATER_PRICES, flow + half_hour, effect, limit)
         return _Look(dc, bus, table, flow, hour, effect, float(rho.max()), present, later)
 
-    def _followed(self, state: GridState, change: F64) -> F64:
+    def _without_curtailed(self, state: GridState, change: F64) -> F64:
         """Of a change of what all elements inject, MW: what is curtailed does not follow its series."""
         change = change.copy()
         curtailed = state.gen_renewable & (state.gen_p_before_curtail[0] - state.gen_p[0] > _AWAY)
