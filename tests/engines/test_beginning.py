@@ -19,12 +19,18 @@ _DRAWN = ("waits", "durations", "choices")
 
 def begun(
     grid: Grid, seeds: np.ndarray, numbers: np.ndarray, maintained: bool, n_steps: int = MAX_STEPS
-) -> tuple[NativeEngine, list[Any]]:
+) -> tuple[NativeEngine, list[EpisodePlan]]:
     engine, rows = NativeEngine(grid, len(seeds)), np.arange(len(seeds))
     library = training_library(grid)
     draws = engine.draw_training(library, seeds, numbers)
     engine.show_training(library, 0, rows, draws, maintained, n_steps)
-    return engine, engine.take_training(library, rows, draws, maintained, n_steps)
+    starts = engine.take_training(library, rows, draws)
+    drawn = zip(seeds.tolist(), numbers.tolist(), *map(np.ndarray.tolist, starts), strict=True)
+    plans = [
+        EpisodePlan(seed, number, scenario_id, row, n_steps, maintained, redraws)
+        for seed, number, scenario_id, row, redraws in drawn
+    ]
+    return engine, plans
 
 
 def assert_same(first: NativeEngine, second: NativeEngine) -> None:

@@ -11,19 +11,20 @@ from numpy.typing import NDArray
 from rl2grid.arrays import I64
 from rl2grid.engines.worlds import World, world_of_plain
 from rl2grid.envs.description import check_number, one_by_one
+from rl2grid.envs.episode_table import StreamPositions
 from rl2grid.envs.info import COSTS, GAME_OVER_WORDS
 from rl2grid.envs.info_arrays import InfoForm
 from rl2grid.envs.options import TaskOptions
 from rl2grid.envs.row_view import RowView, public_names
 from rl2grid.envs.rows import Batch
-from rl2grid.envs.task_environments import StreamPosition, TaskEnvironments
+from rl2grid.envs.task_environments import TaskEnvironments
 from rl2grid.envs.tasks import Task
 from rl2grid.errors import one_of
 from rl2grid.handles import Handle
 from rl2grid.mdp import reports
 from rl2grid.mdp.action_masks import write_action_masks
 from rl2grid.mdp.reports import Report, blank_report, write_outcomes, write_report
-from rl2grid.scenarios.episodes import EpisodePlan
+from rl2grid.scenarios.episodes import EpisodePlan, PlannedStarts, starts_of
 
 Decisions = TypeVar("Decisions")
 """Checked actions of all rows, in the form in which the engine takes them."""
@@ -44,12 +45,7 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
         self._n = n
         self._rows = np.arange(n)
         self._state_handle = Handle(self.state)
-        self._scenarios = np.full(n, "", object)
         self._hashes = [] if self._hash is None else [np.full(n, self._hash, object)]
-        self._episodes = np.zeros((reports.EARLIER_STEPS + 1, n), np.int64)
-        self._starts = self._episodes[reports.START]
-        self._redraws = self._episodes[reports.START_REDRAWS]
-        self._earlier_steps = self._episodes[reports.EARLIER_STEPS]
         self._shown_effects = np.full(n, "", object)
         self._nothing = np.full(n, None, object)
         self._cost = -1 if self.constraint is None else COSTS.index(self.constraint)
@@ -78,7 +74,7 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
             return self._batch(effects, rewards, terminated, truncated)
         (ended,) = (terminated | truncated).nonzero()
         endings = self._endings(ended, effects)
-        self._begin(ended, [None] * len(ended), None)
+        self._begin(ended, None, None)
         effects[ended] = ""
         batch = self._batch(effects, rewards, terminated, truncated)
         batch.infos |= endings
@@ -93,7 +89,7 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
 
     def state_dict(self) -> list[dict[str, Any]]:
         """See :meth:`rl2grid.envs.rows.Rows.state_dict`."""
-        return [self._world(i).to_plain() for i in range(self._n) if self._positions[i] is not None]
+        return [self._world(i).to_plain() for i in self._episodes.begun.nonzero()[0].tolist()]
 
     def load_state_dict(self, rows: list[dict[str, Any]]) -> Batch:
         """See :meth:`rl2grid.envs.rows.Rows.load_state_dict`."""
@@ -148,7 +144,7 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
         """What became of the actions that were played last, object [n]."""
 
     @abstractmethod
-    def _start(self, rows: list[int], plans: list[EpisodePlan]) -> None:
+    def _start(self, rows: I64, plans: list[EpisodePlan]) -> None:
         """Begin episodes in ``rows`` and play to their first decisions."""
 
     @abstractmethod
@@ -159,31 +155,23 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
     def _last_observations(self, rows: I64) -> NDArray[np.float32]:
         """The observations of ``rows``, which stay what they are, float32 [row, feature]."""
 
-    def _begin(self, rows: I64, seeds: list[int | None], options: dict[str, Any] | None) -> None:
+    def _begin(self, rows: I64, seeds: list[int | None] | None, options: dict[str, Any] | None) -> None:
         # All or none: no row may have begun when another's options are refused.
-        numbers = rows.tolist()
-        positions = [self._next_position(i, seed, options) for i, seed in zip(numbers, seeds, strict=True)]
-        plans = self._begin_episodes(numbers, positions)
-        for i, position, plan in zip(numbers, positions, plans, strict=True):
-            self._take(i, position, plan)
+        positions = self._following(rows, seeds, options)
+        self._take(rows, positions, self._begin_episodes(rows, positions))
         self._pending[rows] = self.state.terminated[rows] | self.state.truncated[rows]
 
-    def _begin_episodes(self, rows: list[int], positions: list[StreamPosition]) -> list[EpisodePlan]:
+    def _begin_episodes(self, rows: I64, positions: StreamPositions) -> PlannedStarts:
         """Plan the episodes of ``positions``, begin them in ``rows`` and play to their first decisions."""
-        plans = [self._plan(position) for position in positions]
+        plans = self._plans(positions)
         self._start(rows, plans)
-        return plans
-
-    def _take(self, i: int, position: StreamPosition, plan: EpisodePlan) -> None:
-        super()._take(i, position, plan)
-        self._scenarios[i], self._starts[i], self._earlier_steps[i] = plan.scenario_id, plan.start, position.grid_steps
-        self._redraws[i] = plan.redraws
+        return starts_of(plans)
 
     def _decided(self, actions: Any) -> Decisions:
         """The actions of all rows, checked."""
         if not self._all_begun:
             for i in range(self._n):
-                self._position(i)
+                self._check_begun(i)
             self._all_begun = True
         check_number(self.task, actions, self._n)
         return self._decide(actions)
@@ -210,7 +198,7 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
         report = self._report(rows)
         reasons = GAME_OVER_WORDS.take(report.counts[reports.GAME_OVER])
         words = []
-        for given in (self._scenarios, reasons, effects, *self._hashes):
+        for given in (self._episodes.scenarios, reasons, effects, *self._hashes):
             words.append(self._nothing.copy())
             words[-1][rows] = given[rows]
         last = self._form.named(words, report, told)
@@ -219,7 +207,7 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
     def _report(self, rows: I64) -> Report:
         """Report of ``rows``; the columns of others are blank."""
         report = blank_report(self._n, self.grid.n_line)
-        write_report(self._state_address, rows, self._cost, self._episodes, self._pending, *report)
+        write_report(self._state_address, rows, self._cost, self._episodes.counts, self._pending, *report)
         return report
 
     def _standing_batch(self, effects: NDArray[np.object_]) -> Batch:
@@ -236,6 +224,6 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
         self._shown_effects = effects
         report = self._report(self._rows)
         reasons = GAME_OVER_WORDS.take(report.counts[reports.GAME_OVER])
-        words = (self._scenarios.copy(), reasons, effects, *(each.copy() for each in self._hashes))
+        words = (self._episodes.scenarios.copy(), reasons, effects, *(each.copy() for each in self._hashes))
         infos = self._form.named(words, report)
         return Batch(self._observations(), rewards, terminated, truncated, infos)

@@ -29,8 +29,8 @@ class LocalRows(EngineRows[list[StepAction]]):
         effects[:] = [self.transitions.action_effects[i] for i in range(self._n)]
         return effects
 
-    def _start(self, rows: list[int], plans: list[EpisodePlan]) -> None:
-        for i, plan in zip(rows, plans, strict=True):
+    def _start(self, rows: I64, plans: list[EpisodePlan]) -> None:
+        for i, plan in zip(rows.tolist(), plans, strict=True):
             self.transitions.reset(i, plan)
 
     def _observations(self) -> NDArray[np.float32]:

@@ -13,13 +13,13 @@ from rl2grid.arrays import F32, I64
 from rl2grid.engines.native.orders import refer_to_choices
 from rl2grid.engines.native.transitions import Commands, NativeTransitions, commands_of
 from rl2grid.envs.engine_rows import EngineRows
+from rl2grid.envs.episode_table import StreamPositions
 from rl2grid.envs.options import TaskOptions
-from rl2grid.envs.task_environments import StreamPosition
 from rl2grid.envs.tasks import Task
 from rl2grid.grids import find_system
 from rl2grid.mdp.actions import DO_NOTHING, INJECTION, TOPOLOGY
 from rl2grid.mdp.features import observation_size
-from rl2grid.scenarios.episodes import MAX_STEPS, EpisodePlan
+from rl2grid.scenarios.episodes import MAX_STEPS, EpisodePlan, PlannedStarts
 from rl2grid.scenarios.months import GeneratedScenarios
 from rl2grid.scenarios.splits import TRAIN
 
@@ -65,38 +65,36 @@ class NativeRows(EngineRows[Commands]):
     def _effects(self, decisions: Commands) -> NDArray[np.object_]:
         return self.transitions.action_effects_of(decisions)
 
-    def _begin_episodes(self, rows: list[int], positions: list[StreamPosition]) -> list[EpisodePlan]:
+    def _begin_episodes(self, rows: I64, positions: StreamPositions) -> PlannedStarts:
         if not self._plays_library(positions):
             return super()._begin_episodes(rows, positions)
         return self.transitions.begin_training(
-            np.array(rows),
-            np.array([position.seed for position in positions], np.int64),
-            np.array([position.number for position in positions], np.int64),
+            rows,
+            positions.seeds.astype(np.int64),
+            positions.numbers,
             self.options.maintenance,
             self.num_threads,
             self.options.episode_length or MAX_STEPS,
         )
 
-    def _plays_library(self, positions: list[StreamPosition]) -> bool:
+    def _plays_library(self, positions: StreamPositions) -> bool:
         """Whether episodes are drawn from the library of training years, and nobody chooses anything of them."""
-        scenarios, chosen = find_system(self.grid.id).scenarios, self.options.scenario is not None
-        return (
-            self.transitions.is_compiled
-            and self.options.split == TRAIN
-            and isinstance(scenarios, GeneratedScenarios)
-            and scenarios.generator_version(TRAIN) is not None
-            and not any(chosen or position.options or position.seed > _LARGEST_SEED for position in positions)
-        )
+        if positions.options or not self.transitions.is_compiled or max(positions.seeds, default=0) > _LARGEST_SEED:
+            return False
+        if self.options.split != TRAIN or self.options.scenario is not None:
+            return False
+        scenarios = find_system(self.grid.id).scenarios
+        return isinstance(scenarios, GeneratedScenarios) and scenarios.generator_version(TRAIN) is not None
 
-    def _start(self, rows: list[int], plans: list[EpisodePlan]) -> None:
+    def _start(self, rows: I64, plans: list[EpisodePlan]) -> None:
         if not self.transitions.is_compiled:
-            for i, plan in zip(rows, plans, strict=True):
+            for i, plan in zip(rows.tolist(), plans, strict=True):
                 self.transitions.reset(i, plan)
             return
-        for i, plan in zip(rows, plans, strict=True):
+        for i, plan in zip(rows.tolist(), plans, strict=True):
             self.transitions.engine.prepare(i, plan)
             self.transitions.action_effects[i] = ""
-        self.transitions.begin_rows(np.array(rows), self.num_threads)
+        self.transitions.begin_rows(rows, self.num_threads)
 
     def _observations(self) -> NDArray[np.float32]:
         self._buffers.reverse()

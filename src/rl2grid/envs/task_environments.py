@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from datetime import datetime
-from typing import TYPE_CHECKING, Any, NamedTuple, Self, cast
+from typing import TYPE_CHECKING, Any, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rl2grid.arrays import I64
 from rl2grid.engines.action_effects import clipping, refusal
 from rl2grid.engines.base import Engine
 from rl2grid.engines.transition import Listener, Transitions
 from rl2grid.engines.worlds import Standing, Trail, World
 from rl2grid.envs.description import action_number, step_action, task_catalogue
+from rl2grid.envs.episode_table import EpisodeTable, StreamPositions
 from rl2grid.envs.info import episode_info
 from rl2grid.envs.operation import Operation, operation_of
 from rl2grid.envs.operator_features import OperatorFeatures
@@ -33,7 +35,7 @@ from rl2grid.mdp.legality import verdict_on
 from rl2grid.mdp.observations import observation_writer
 from rl2grid.mdp.rewards import resolve_reward, reward_name
 from rl2grid.mdp.state import GridState
-from rl2grid.scenarios.episodes import EpisodePlan, plan_episode
+from rl2grid.scenarios.episodes import EpisodePlan, PlannedStarts, plan_episode, starts_of
 from rl2grid.scenarios.library import open_series
 from rl2grid.scenarios.scenario import STEP
 
@@ -42,16 +44,6 @@ if TYPE_CHECKING:
     from rl2grid.engines.native.what_if import ActionOutcomes, OutageOutcomes, WhatIf
 
 _RESET_OPTIONS = ("scenario", "start")
-
-
-class StreamPosition(NamedTuple):
-    """Where one environment is in its stream of episodes."""
-
-    seed: int
-    number: int
-    options: Mapping[str, Any]
-    grid_steps: int = 0
-    """Grid steps played in earlier episodes of the seed's stream."""
 
 
 @dataclass(frozen=True)
@@ -108,8 +100,7 @@ class TaskEnvironments:
             self._operator = OperatorFeatures(task, options.operator_features, self.engine, shift, scale)
         self._catalogue = task_catalogue(task, self.grid)
         self._hash = action_set_hash(self.grid, task.level) if task.changes_topology else None
-        self._plans: list[EpisodePlan | None] = [None] * n
-        self._positions: list[StreamPosition | None] = [None] * n
+        self._episodes = EpisodeTable(n, options.maintenance)
         self._pending = np.zeros(n, np.bool_)  # the episode ended inside reset, its ending is still to be returned
         self._solver: WhatIf | None = None
         self.imagined = np.zeros(n, np.bool_)
@@ -129,10 +120,11 @@ class TaskEnvironments:
         Raises:
             UsageError: an option is unknown, or names a scenario or start that does not exist.
         """
-        position = self._next_position(i, seed, options)
-        plan = self._plan(position)
-        self._take(i, position, plan)
-        self.transitions.reset(i, plan)
+        row = np.array([i])
+        positions = self._following(row, [seed], options)
+        plans = self._plans(positions)
+        self._take(row, positions, starts_of(plans))
+        self.transitions.reset(i, plans[0])
         self._pending[i] = self.is_over(i)
 
     def play(self, i: int, action: Any) -> None:
@@ -141,7 +133,7 @@ class TaskEnvironments:
         Raises:
             UsageError: the action has the wrong shape or value, or the episode is over.
         """
-        self._position(i)
+        self._check_begun(i)
         played = self._step_action(action)
         if self._pending[i]:
             self._pending[i] = False
@@ -163,7 +155,7 @@ class TaskEnvironments:
 
     def observe(self, i: int, scaled: bool) -> dict[str, NDArray[np.float32]]:
         """The observation of row ``i`` by name; see :meth:`rl2grid.envs.row_view.RowMethods.observe`."""
-        self._position(i)
+        self._check_begun(i)
         values = np.zeros(self._size, np.float32)
         self._observe(i, values)
         if scaled:
@@ -177,11 +169,10 @@ class TaskEnvironments:
 
     def info(self, i: int) -> dict[str, Any]:
         """The ``info`` of row ``i``; see :data:`rl2grid.envs.info.INFO_KEYS`."""
-        plan, position, state = self._plans[i], self._position(i), self.state
-        assert plan is not None
+        plan, state = self._plan(i), self.state
         info = {**_start_info(plan), **episode_info(state, i, self.constraint)}
         info["action_effect"] = self.transitions.action_effects[i]
-        info["grid_steps"] = position.grid_steps + info["step"]
+        info["grid_steps"] = self._episodes.earlier_steps(i) + info["step"]
         info["over"] = bool(self._pending[i])
         if self.options.gamma is not None:
             info["discounted_reward"] = float(state.transition_discounted[i])
@@ -203,8 +194,8 @@ class TaskEnvironments:
         """What one step of ``action`` would bring on the forecast; see :meth:`PowerGridEnv.simulate`."""
         if not isinstance(horizon, int) or horizon < 1:
             raise UsageError(f"horizon={horizon!r} is not allowed: give a number of steps, at least 1.")
-        plan, played = self._plans[i], self._step_action(action)
-        if plan is None or self.is_over(i):
+        played = self._step_action(action)
+        if not self._is_playing(i):
             raise UsageError("There is no episode in progress to simulate from: call reset first.")
         effect = refusal(self.grid, verdict_on(self.state, i, played))
         result = self.transitions.simulate(i, played, horizon)
@@ -214,16 +205,14 @@ class TaskEnvironments:
         if self._operator is not None:
             self._operator.write_raw(forecast, 0, i, observation)
         self._scale(observation)
-        info = {**_start_info(plan), **episode_info(result, 0, self.constraint)}
+        info = {**_start_info(self._plan(i)), **episode_info(result, 0, self.constraint)}
         info["action_effect"] = effect or clipping(self.grid, result, 0, played)
         reward = float(result.transition_reward[0])
         return SimulationResult(observation, reward, info["cost"], bool(result.terminated[0]), info)
 
     def clock(self, i: int, step: int) -> datetime:
         """The time in the scenario after ``step`` steps of the episode of row ``i``."""
-        self._position(i)
-        plan = self._plans[i]
-        assert plan is not None
+        plan = self._plan(i)
         return open_series(self.grid.id, plan.scenario_id).start_datetime + (plan.start + step) * STEP
 
     def what_if(self, i: int, actions: Sequence[int] | None) -> ActionOutcomes:
@@ -265,7 +254,7 @@ class TaskEnvironments:
         return n_minus_1_score(self._native_engine(i), i)
 
     def _native_engine(self, i: int) -> NativeEngine:
-        if self._plans[i] is None or self.is_over(i):
+        if not self._is_playing(i):
             raise UsageError("There is no episode in progress to ask about: call reset first.")
         if self.options.engine != "native":
             raise UsageError('A what-if is answered by the native engine only: choose engine="native".')
@@ -277,7 +266,7 @@ class TaskEnvironments:
         Raises:
             UsageError: it was not reset yet.
         """
-        self._position(i)
+        self._check_begun(i)
         if not self.imagined[i] and i not in self._trails:
             self._trails[i] = Trail(int(self.state.step[i]))
         return self._world(i)
@@ -291,8 +280,7 @@ class TaskEnvironments:
         """
         standing = self._checked_standing(world)
         self.engine.restore(i, world)
-        options = dict(standing.reset_options)
-        self._take(i, StreamPosition(standing.seed, standing.number, options, standing.earlier_steps), standing.plan)
+        self._take(np.array([i]), _positions_of(standing), starts_of([standing.plan]))
         self.transitions.action_effects[i] = standing.effect
         self._pending[i], self.imagined[i], self.foresight[i] = standing.pending, world.imagined, standing.foresight
         if standing.trail is not None:
@@ -306,7 +294,7 @@ class TaskEnvironments:
         """
         if not isinstance(seed, int | np.integer) or seed < 0:
             raise UsageError(f"seed={seed!r} is not allowed: give an integer, not negative.")
-        self._position(i)
+        self._check_begun(i)
         seed = int(seed)
         standing = self._standing(i)
         # Nobody can know the seed of the true episode, from which attacks follow. Later episodes are another stream's.
@@ -319,26 +307,25 @@ class TaskEnvironments:
         return cast("Self", rebuild(kind, arguments, worlds, copy.deepcopy(listeners, memo)))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        worlds = [None if position is None else self.save(i) for i, position in enumerate(self._positions)]
+        worlds = [self.save(i) if begun else None for i, begun in enumerate(self._episodes.begun)]
         return _rebuild, (type(self), self._arguments(), worlds, self.transitions.listeners)
 
     def _arguments(self) -> tuple[Any, ...]:
         """What these environments were made with."""
-        return self.task, self.options, len(self._positions)
+        return self.task, self.options, len(self._pending)
 
     def _world(self, i: int) -> World:
         return self.engine.save(i).at(self._standing(i))
 
     def _standing(self, i: int) -> Standing:
-        plan, position = self._plans[i], self._position(i)
-        assert plan is not None
+        plan = self._plan(i)
         return Standing(
             task=self.task.id,
             options=self._keywords,
-            seed=position.seed,
-            number=position.number,
-            reset_options=tuple(position.options.items()),
-            earlier_steps=position.grid_steps,
+            seed=plan.seed,
+            number=plan.number,
+            reset_options=tuple(self._episodes.options(i).items()),
+            earlier_steps=self._episodes.earlier_steps(i),
             pending=bool(self._pending[i]),
             plan=plan,
             effect=self._effect(i),
@@ -384,53 +371,58 @@ class TaskEnvironments:
         Raises:
             UsageError: the environment was not reset yet.
         """
-        self._position(i)
-        plan = self._plans[i]
-        assert plan is not None
-        return operation_of(self.state, i, self.grid.id, plan)
+        return operation_of(self.state, i, self.grid.id, self._plan(i))
 
     def close(self) -> None:
         self.engine.close()
 
-    def _position(self, i: int) -> StreamPosition:
-        position = self._positions[i]
-        if position is None:
+    def _check_begun(self, i: int) -> None:
+        if not self._episodes.begun[i]:
             raise UsageError("The environment was not reset yet: call reset first.")
-        return position
 
-    def _take(self, i: int, position: StreamPosition, plan: EpisodePlan) -> None:
-        """Move row ``i`` to an episode of its stream."""
-        self._positions[i], self._plans[i] = position, plan
+    def _is_playing(self, i: int) -> bool:
+        return bool(self._episodes.begun[i]) and not self.is_over(i)
+
+    def _plan(self, i: int) -> EpisodePlan:
+        """What was decided of the episode of row ``i``."""
+        self._check_begun(i)
+        return self._episodes.plan(i, int(self.state.episode_length[i]))
+
+    def _take(self, rows: I64, positions: StreamPositions, starts: PlannedStarts) -> None:
+        """Move ``rows`` to episodes of their streams, an entry each."""
+        self._episodes.take(rows, positions, starts)
+        self.imagined[rows], self.foresight[rows] = False, 0
         if self._operator is not None:
-            began = open_series(self.grid.id, plan.scenario_id).start_datetime + plan.start * STEP
-            self._operator.begin(i, began)
-        self.imagined[i], self.foresight[i] = False, 0
-        self._trails.pop(i, None)
+            for i, scenario_id, start in zip(rows.tolist(), starts.scenario_ids, starts.rows.tolist(), strict=True):
+                self._operator.begin(i, open_series(self.grid.id, scenario_id).start_datetime + start * STEP)
+        if self._trails:
+            for i in rows.tolist():
+                self._trails.pop(i, None)
 
-    def _next_position(self, i: int, seed: int | None, options: dict[str, Any] | None) -> StreamPosition:
+    def _following(self, rows: I64, seeds: list[int | None] | None, options: dict[str, Any] | None) -> StreamPositions:
+        """The episodes that ``rows`` play next; see :meth:`EpisodeTable.following`."""
         options = options or {}
         for name in options:
             if name not in _RESET_OPTIONS:
                 raise UsageError(f"Reset option {name!r} does not exist: choose from {', '.join(_RESET_OPTIONS)}.")
-        previous = self._positions[i]
-        if seed is None and previous is not None:
-            played = previous.grid_steps + int(self.state.step[i])
-            return StreamPosition(previous.seed, previous.number + 1, options, played)
-        if seed is None:
-            seed = int(np.random.SeedSequence().generate_state(1, np.uint64)[0] >> np.uint64(1))
-        return StreamPosition(int(seed), 0, options)
+        return self._episodes.following(rows, seeds, options, self.state.step)
 
-    def _plan(self, position: StreamPosition) -> EpisodePlan:
-        return plan_episode(
-            self.grid,
-            self.options.split,
-            position.seed,
-            position.number,
-            scenario=position.options.get("scenario", self.options.scenario),
-            start=position.options.get("start"),
-            maintenance=self.options.maintenance,
-            episode_length=self.options.episode_length,
-        )
+    def _plans(self, positions: StreamPositions) -> list[EpisodePlan]:
+        """Decide the episodes of ``positions``."""
+        scenario, start = positions.options.get("scenario", self.options.scenario), positions.options.get("start")
+        return [
+            plan_episode(
+                self.grid,
+                self.options.split,
+                seed,
+                number,
+                scenario=scenario,
+                start=start,
+                maintenance=self.options.maintenance,
+                episode_length=self.options.episode_length,
+            )
+            for seed, number in zip(positions.seeds, positions.numbers.tolist(), strict=True)
+        ]
 
     def _observe(self, i: int, out: NDArray[np.float32]) -> None:
         """Write what is observed of row ``i``, in raw units."""
@@ -458,6 +450,11 @@ def _rebuild(
         if world is not None:
             environments.restore(i, world)
     return environments
+
+
+def _positions_of(standing: Standing) -> StreamPositions:
+    seed, number = np.array([standing.seed], object), np.array([standing.number])
+    return StreamPositions(seed, number, np.array([standing.earlier_steps]), dict(standing.reset_options))
 
 
 def _in_words(value: Any) -> str:

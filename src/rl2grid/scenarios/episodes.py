@@ -5,6 +5,7 @@ All of it is a function of the seed and the episode's number, and of nothing els
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -46,6 +47,17 @@ class EpisodePlan(NamedTuple):
     """Whether planned outages happen."""
     redraws: int = 0
     """Rows that were drawn as the start before, and overload a line with nothing done."""
+
+
+class PlannedStarts(NamedTuple):
+    """What is drawn of several episodes, one entry each; see :class:`EpisodePlan`."""
+
+    scenario_ids: NDArray[np.object_]
+    """object [k]."""
+    rows: NDArray[np.int64]
+    """int64 [k], of the scenario, that the resets show."""
+    redraws: NDArray[np.int64]
+    """int64 [k], rows that were drawn before."""
 
 
 class _Start(NamedTuple):
@@ -100,6 +112,15 @@ def plan_episode(
     check_length(scenario, series.n_steps, episode_length, int(start))
     n_steps = min(MAX_STEPS, series.n_steps - int(start)) if episode_length is None else episode_length
     return EpisodePlan(seed, number, scenario, int(start), n_steps, maintenance, redraws)
+
+
+def starts_of(plans: Sequence[EpisodePlan]) -> PlannedStarts:
+    """What was drawn of ``plans``."""
+    return PlannedStarts(
+        np.array([plan.scenario_id for plan in plans], object),
+        np.array([plan.start for plan in plans], np.int64),
+        np.array([plan.redraws for plan in plans], np.int64),
+    )
 
 
 def admissible_starts(n_steps: int, episode_length: int | None = None) -> int:

@@ -26,7 +26,7 @@ from rl2grid.engines.native.environments import SEPARATE, Environments, new_envi
 from rl2grid.engines.native.hidden_state import new_hidden_state
 from rl2grid.engines.native.imagination import imagined_rows, outlook_of
 from rl2grid.engines.native.orders import write_order
-from rl2grid.engines.native.playing import Playing, playing_named, playing_series
+from rl2grid.engines.native.playing import Playing, playing_months, playing_named, playing_series
 from rl2grid.engines.native.training_library import TrainingLibrary
 from rl2grid.engines.native.worlds import RowLayout, restore_row, save_row
 from rl2grid.engines.worlds import Home, Outlook, SeriesName, World, grid_fingerprint
@@ -38,10 +38,10 @@ from rl2grid.mdp.opponents import OpponentDraws, draw_opponent, load_draws
 from rl2grid.mdp.state import GridState
 from rl2grid.mdp.termination import GameOver
 from rl2grid.powerflow.model import Network, load_network
-from rl2grid.scenarios.episodes import MAX_STEPS, EpisodePlan, planned_outages
+from rl2grid.scenarios.episodes import MAX_STEPS, EpisodePlan, PlannedStarts, planned_outages
 from rl2grid.scenarios.library import open_series
 from rl2grid.scenarios.scenario import Scenario
-from rl2grid.scenarios.splits import YEARS_FOR_FIRST
+from rl2grid.scenarios.splits import FIRST_TRAINING_SEED, YEARS_FOR_FIRST
 from rl2grid.scenarios.training_years import TrainingMonths
 from rl2grid.streams import Purpose, Stream
 from rl2grid.structures import with_own_workspace
@@ -77,9 +77,10 @@ class NativeEngine:
         self.network = load_network(grid) if network is None else network
         self._opponent = opponent
         self.attacks = opponent and grid.opponent.kind != "none"
-        self._playing: list[Playing | None] = [None] * n
+        # Of an episode that was begun in compiled code the library, until somebody asks for more.
+        self._playing: list[Playing | TrainingLibrary | None] = [None] * n
         # Behind an imagined future: planners come back to it.
-        self._true: list[Playing | None] = [None] * n
+        self._true: list[Playing | TrainingLibrary | None] = [None] * n
         self._use(new_environments(grid, self.network, n, self.attacks))
         self._simulated = self._new_simulated()
         # Of threads that play transitions: a question from outside keeps its answer in the one above.
@@ -162,19 +163,11 @@ class NativeEngine:
         """Show the first rows of the episodes that were drawn, in ``rows``; threads may show different ones."""
         begin_episodes(self.address_for(thread), library.address, rows, draws, maintained, self.attacks, n_steps)
 
-    def take_training(
-        self, library: TrainingLibrary, rows: I64, draws: Draws, maintained: bool, n_steps: int = MAX_STEPS
-    ) -> list[EpisodePlan]:
-        """Note what was begun in ``rows``; returns the plans of the episodes."""
-        series, forecasts, plans = self.environments.hidden.series[rows], self.environments.hidden.forecast[rows], []
-        for k, (i, seed, number, year, month, start, redraws) in enumerate(
-            zip(rows.tolist(), *map(np.ndarray.tolist, draws), strict=True)
-        ):
-            months = library.months(year, month)
-            name = SeriesName(months.id, months.content_hash, start)
-            self._playing[i] = self._true[i] = Playing(name, months, series[k], forecasts[k])
-            plans.append(EpisodePlan(seed, number, months.id, start, n_steps, maintained, redraws))
-        return plans
+    def take_training(self, library: TrainingLibrary, rows: I64, draws: Draws) -> PlannedStarts:
+        """Note what was begun in ``rows``, and say it."""
+        for i in rows.tolist():
+            self._playing[i] = self._true[i] = library
+        return PlannedStarts(library.scenario_ids[draws.year, draws.month], draws.start, draws.redraws)
 
     def step(self, i: int, action: StepAction) -> None:
         """Play one grid step of environment ``i``."""
@@ -299,7 +292,12 @@ class NativeEngine:
         playing = self._playing[i]
         if playing is None:
             raise UsageError("The environment was not reset yet: call reset first.")
-        return playing
+        if isinstance(playing, Playing):
+            return playing
+        hidden = self.environments.hidden
+        months = playing.months(int(hidden.year[i]) - FIRST_TRAINING_SEED, int(hidden.month[i]))
+        opened = self._playing[i] = self._true[i] = playing_months(months, int(hidden.month_row[i]))
+        return opened
 
     @property
     def address(self) -> int:

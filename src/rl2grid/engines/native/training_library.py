@@ -16,7 +16,7 @@ from rl2grid.scenarios.cache import data_folder
 from rl2grid.scenarios.generator.calendar import MONTH_STEPS, month_start
 from rl2grid.scenarios.generator.constants import load_constants
 from rl2grid.scenarios.making import make_library_beside
-from rl2grid.scenarios.month_names import MONTHS, Months
+from rl2grid.scenarios.month_names import MONTHS, Months, name_of
 from rl2grid.scenarios.outage_draws import most_outages, outage_model
 from rl2grid.scenarios.splits import FIRST_TRAINING_SEED, TRAINING_YEARS
 from rl2grid.scenarios.training_years import TrainingMonths, TrainingYear, forecasts_of, training_year
@@ -56,6 +56,14 @@ class TrainingLibrary:
         """Of the handle to the :class:`~rl2grid.engines.native.beginning.Library`."""
         self.most_outages = most_outages(outages)
         """No episode has more."""
+        self.scenario_ids = np.array(
+            [
+                [f"generated/{name_of(_months(year, month))}" for month in range(MONTHS - 1)]
+                for year in range(TRAINING_YEARS)
+            ],
+            object,
+        )
+        """Of each year and each first of two months, object [year, month]."""
         self._years: dict[int, TrainingYear] = {}
         self._months: dict[tuple[int, int], TrainingMonths] = {}
 
@@ -77,9 +85,13 @@ class TrainingLibrary:
         """Two months in a row of an open year."""
         found = self._months.get((year, month))
         if found is None:
-            months = Months(FIRST_TRAINING_SEED + year, month, 2)
-            found = self._months[year, month] = TrainingMonths(self._grid, months, self._years[year])
+            found = TrainingMonths(self._grid, _months(year, month), self._years[year])
+            self._months[year, month] = found
         return found
+
+
+def _months(year: int, month: int) -> Months:
+    return Months(FIRST_TRAINING_SEED + year, month, 2)
 
 
 def training_library(grid: Grid) -> TrainingLibrary:

@@ -54,7 +54,7 @@ from rl2grid.mdp.actions import (
 from rl2grid.mdp.features import changes_topology, injects
 from rl2grid.mdp.rewards import default_components, paper_components, released_components
 from rl2grid.mdp.security import Security
-from rl2grid.scenarios.episodes import MAX_STEPS, EpisodePlan
+from rl2grid.scenarios.episodes import MAX_STEPS, EpisodePlan, PlannedStarts
 from rl2grid.structures import with_own_workspace
 
 _COMPILED_IN: dict[Callable[..., Any], int] = {
@@ -275,7 +275,7 @@ class NativeTransitions(Transitions):
         maintained: bool,
         num_threads: int,
         n_steps: int = MAX_STEPS,
-    ) -> list[EpisodePlan]:
+    ) -> PlannedStarts:
         """Begin the training episodes ``numbers`` of ``seeds`` in ``rows`` and play to their first decisions.
 
         What is begun is what :func:`~rl2grid.scenarios.episodes.plan_episode` plans of the library of training years;
@@ -293,10 +293,8 @@ class NativeTransitions(Transitions):
 
         self._in_threads(show, len(rows), num_threads)
         self._advance(rows, self._nothing[: len(rows)], num_threads, True)
-        plans = self.engine.take_training(library, rows, draws, maintained, n_steps)
-        for i in rows.tolist():
-            self.action_effects[i] = ""
-        return plans
+        self.action_effects.update(dict.fromkeys(rows.tolist(), ""))
+        return self.engine.take_training(library, rows, draws)
 
     def write_observations(self, rows: I64, shift: F32, scale: F32, out: F32) -> None:
         """Write the observations of ``rows``, shifted and scaled, to the same rows of ``out``, float32 [n, feature]."""
