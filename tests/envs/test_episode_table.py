@@ -39,6 +39,16 @@ def test_who_was_never_begun_plays_a_stream_of_its_own_where_no_seed_is_given() 
     assert table.plan(0, 5).seed > 2**32, "a seed that nobody chose is drawn from all there are"
 
 
+def test_a_row_that_is_moved_alone_goes_on_from_there() -> None:
+    table, plan = EpisodeTable(2, maintenance=True), EpisodePlan(3, 8, "a month", 2, 5, True, 1)
+    begin(table, [0, 1], [1, 2], {"start": 4})
+    table.take_one(1, plan, 60, {})
+    assert (table.plan(1, 5), table.earlier_steps(1), table.options(1)) == (plan, 60, {})
+    assert (table.plan(0, 5).seed, table.options(0)) == (1, {"start": 4})
+    begin(table, [1], None)
+    assert (table.plan(1, 5)[:2], table.earlier_steps(1)) == ((3, 9), 70)
+
+
 def test_options_of_a_reset_are_those_of_its_episode_alone() -> None:
     table = EpisodeTable(2, maintenance=True)
     begin(table, [0, 1], [1, 2], {"start": 4})

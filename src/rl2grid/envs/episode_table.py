@@ -81,6 +81,13 @@ class EpisodeTable:
             for i in rows.tolist():
                 self._options[i] = positions.options
 
+    def take_one(self, i: int, plan: EpisodePlan, grid_steps: int, options: Mapping[str, Any]) -> None:
+        """Note what row ``i`` plays now; see :class:`StreamPositions`."""
+        self.begun[i] = True
+        self.scenarios[i] = plan.scenario_id
+        self.counts[:, i] = plan.start, plan.redraws, grid_steps
+        self._seeds[i], self._numbers[i], self._options[i] = plan.seed, plan.number, options
+
     def plan(self, i: int, n_steps: int) -> EpisodePlan:
         """What was decided of the episode of row ``i``, which is completed after ``n_steps`` steps."""
         return EpisodePlan(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from datetime import datetime
 from typing import TYPE_CHECKING, Any, Self, cast
@@ -35,7 +35,7 @@ from rl2grid.mdp.legality import verdict_on
 from rl2grid.mdp.observations import observation_writer
 from rl2grid.mdp.rewards import resolve_reward, reward_name
 from rl2grid.mdp.state import GridState
-from rl2grid.scenarios.episodes import EpisodePlan, PlannedStarts, plan_episode, starts_of
+from rl2grid.scenarios.episodes import EpisodePlan, PlannedStarts, plan_episode
 from rl2grid.scenarios.library import open_series
 from rl2grid.scenarios.scenario import STEP
 
@@ -120,11 +120,10 @@ class TaskEnvironments:
         Raises:
             UsageError: an option is unknown, or names a scenario or start that does not exist.
         """
-        row = np.array([i])
-        positions = self._following(row, [seed], options)
-        plans = self._plans(positions)
-        self._take(row, positions, starts_of(plans))
-        self.transitions.reset(i, plans[0])
+        position = self._following(np.array([i]), [seed], options)
+        (plan,) = self._plans(position)
+        self._take_one(i, plan, int(position.grid_steps[0]), position.options)
+        self.transitions.reset(i, plan)
         self._pending[i] = self.is_over(i)
 
     def play(self, i: int, action: Any) -> None:
@@ -212,8 +211,8 @@ class TaskEnvironments:
 
     def clock(self, i: int, step: int) -> datetime:
         """The time in the scenario after ``step`` steps of the episode of row ``i``."""
-        plan = self._plan(i)
-        return open_series(self.grid.id, plan.scenario_id).start_datetime + (plan.start + step) * STEP
+        self._check_begun(i)
+        return self._beginning(i) + step * STEP
 
     def what_if(self, i: int, actions: Sequence[int] | None) -> ActionOutcomes:
         """What each action would do in the next step; see :meth:`PowerGridEnv.what_if`."""
@@ -280,7 +279,7 @@ class TaskEnvironments:
         """
         standing = self._checked_standing(world)
         self.engine.restore(i, world)
-        self._take(np.array([i]), _positions_of(standing), starts_of([standing.plan]))
+        self._take_one(i, standing.plan, standing.earlier_steps, dict(standing.reset_options))
         self.transitions.action_effects[i] = standing.effect
         self._pending[i], self.imagined[i], self.foresight[i] = standing.pending, world.imagined, standing.foresight
         if standing.trail is not None:
@@ -388,16 +387,26 @@ class TaskEnvironments:
         self._check_begun(i)
         return self._episodes.plan(i, int(self.state.episode_length[i]))
 
+    def _take_one(self, i: int, plan: EpisodePlan, grid_steps: int, options: Mapping[str, Any]) -> None:
+        """Move row ``i`` to an episode of its stream."""
+        self._episodes.take_one(i, plan, grid_steps, options)
+        self._forget(i)
+
     def _take(self, rows: I64, positions: StreamPositions, starts: PlannedStarts) -> None:
         """Move ``rows`` to episodes of their streams, an entry each."""
         self._episodes.take(rows, positions, starts)
-        self.imagined[rows], self.foresight[rows] = False, 0
+        if self._operator is None and not self._trails:
+            self.imagined[rows], self.foresight[rows] = False, 0
+            return
+        for i in rows.tolist():
+            self._forget(i)
+
+    def _forget(self, i: int) -> None:
+        """Leave behind what was noted of the last episode of row ``i``."""
+        self.imagined[i], self.foresight[i] = False, 0
+        self._trails.pop(i, None)
         if self._operator is not None:
-            for i, scenario_id, start in zip(rows.tolist(), starts.scenario_ids, starts.rows.tolist(), strict=True):
-                self._operator.begin(i, open_series(self.grid.id, scenario_id).start_datetime + start * STEP)
-        if self._trails:
-            for i in rows.tolist():
-                self._trails.pop(i, None)
+            self._operator.begin(i, self._beginning(i))
 
     def _following(self, rows: I64, seeds: list[int | None] | None, options: dict[str, Any] | None) -> StreamPositions:
         """The episodes that ``rows`` play next; see :meth:`EpisodeTable.following`."""
@@ -406,6 +415,11 @@ class TaskEnvironments:
             if name not in _RESET_OPTIONS:
                 raise UsageError(f"Reset option {name!r} does not exist: choose from {', '.join(_RESET_OPTIONS)}.")
         return self._episodes.following(rows, seeds, options, self.state.step)
+
+    def _beginning(self, i: int) -> datetime:
+        """The time in the scenario when the episode of row ``i`` began."""
+        plan = self._plan(i)
+        return open_series(self.grid.id, plan.scenario_id).start_datetime + plan.start * STEP
 
     def _plans(self, positions: StreamPositions) -> list[EpisodePlan]:
         """Decide the episodes of ``positions``."""
@@ -450,11 +464,6 @@ def _rebuild(
         if world is not None:
             environments.restore(i, world)
     return environments
-
-
-def _positions_of(standing: Standing) -> StreamPositions:
-    seed, number = np.array([standing.seed], object), np.array([standing.number])
-    return StreamPositions(seed, number, np.array([standing.earlier_steps]), dict(standing.reset_options))
 
 
 def _in_words(value: Any) -> str:
