@@ -2,11 +2,13 @@
 
 Pages name the tasks, with ``<!-- results: bus14-T0 -->``, or with ``<!-- figure: bus14-T0 -->`` for the figure alone;
 ``<!-- overview -->`` is the table of all tasks, ``<!-- learned -->`` that of methods trained with several seeds,
-``<!-- bounds -->`` what those survive who know what comes, beside who does not.
+``<!-- untrained -->`` that of who learns nothing, ``<!-- bounds -->`` what those survive who know what comes, beside
+who does not.
 """
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Mapping
 from functools import partial
@@ -22,15 +24,17 @@ from rl2grid.analysis.ledger_figure import draw_ledger
 from rl2grid.analysis.ledger_learned import learned_table
 from rl2grid.analysis.ledger_overview import overview_table
 from rl2grid.analysis.ledger_table import short_ledger_table
+from rl2grid.analysis.ledger_untrained import Milliseconds, untrained_table
 from rl2grid.envs.tasks import find_task
 from rl2grid.records.ledger import HashedTest, read_ledger
 
 RESULTS = Path(__file__).resolve().parents[2] / "benchmarks" / "results"
-LEDGER, BOUNDS = RESULTS / "baselines.json", RESULTS / "bounds.json"
+LEDGER, BOUNDS, TIMES = (RESULTS / f"{name}.json" for name in ("baselines", "bounds", "decision_time"))
 PAGES = ("results.md", "index.md")
 _TABLES = {
     "<!-- overview -->": overview_table,
     "<!-- learned -->": learned_table,
+    "<!-- untrained -->": lambda results: untrained_table(results, _milliseconds()),
     "<!-- bounds -->": lambda results: headroom_table(results, read_ledger(BOUNDS)),
 }
 _MARK = re.compile(r"<!-- (results|figure): (\S+) -->")
@@ -63,3 +67,17 @@ def _shown(results: Mapping[str, HashedTest], mark: re.Match[str]) -> str:
     if kind == "figure":
         return figure
     return f"{figure}\n\n{short_ledger_table(results, find_task(task).id)}"
+
+
+def _milliseconds() -> Milliseconds:
+    """Of a decision, as ``benchmarks/decision_time.py`` has measured it."""
+    return {
+        (task, *_agent_and_heuristic(name)): row["milliseconds"][0]
+        for task, measured in json.loads(TIMES.read_text()).items()
+        for name, row in measured["rows"].items()
+    }
+
+
+def _agent_and_heuristic(name: str) -> tuple[str, str | None]:
+    agent, _, heuristic = name.partition(":")
+    return agent, heuristic or None

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from rl2grid.records.evaluations import Evaluation
 
 _SUBJECT = "a run folder, pretrained/NAME, or an agent without training as greedy@bus14-T0 or random@bus14-T0:idle"
+_OF_ALL_TASKS = "best", "learned", "untrained"
 DIFFERENT = 1
 """Exit status when an entry is not what its actions make."""
 
@@ -82,6 +83,9 @@ def _add_table(actions: Any) -> None:
     )
     parser.add_argument(
         "--learned", action="store_true", help="of a ledger: methods trained with several seeds, a row per task"
+    )
+    parser.add_argument(
+        "--untrained", action="store_true", help="of a ledger: doing nothing, search and plans, a row per task"
     )
     add_scores_flag(parser)
     parser.set_defaults(run=_table)
@@ -172,7 +176,7 @@ def _verified(found: Mapping[str, str | None], output: Output) -> int:
 def _check_what_is_ranked(options: argparse.Namespace) -> None:
     """Refuse files beside a ledger, and flags of the one for the other: they would be passed over in silence."""
     shown = {"--task": options.only, "--to": options.to}
-    of_all_tasks = {"--best": options.best or None, "--learned": options.learned or None}
+    of_all_tasks = {f"--{name}": getattr(options, name) or None for name in _OF_ALL_TASKS}
     if options.ledger is None:
         for flag, value in {**shown, **of_all_tasks}.items():
             if value is not None:
@@ -182,7 +186,7 @@ def _check_what_is_ranked(options: argparse.Namespace) -> None:
     if asked and any(value is not None for value in shown.values()):
         raise UsageError(f"{asked[0]} shows all tasks and compares nothing: leave out --task and --to.")
     if len(asked) > 1:
-        raise UsageError("--best and --learned are two tables: ask for one of them.")
+        raise UsageError(f"{' and '.join(asked)} are different tables: ask for one of them.")
     if options.files:
         raise UsageError("Entries and a --ledger do not belong into one table: name the one or the other.")
     if options.l2rpn:
@@ -195,11 +199,14 @@ def _ledger_text(options: argparse.Namespace, tests: Mapping[str, HashedTest]) -
     from rl2grid.analysis.ledger_learned import learned_table
     from rl2grid.analysis.ledger_overview import overview_table
     from rl2grid.analysis.ledger_table import ledger_table
+    from rl2grid.analysis.ledger_untrained import untrained_table
 
     if options.best:
         return overview_table(tests)
     if options.learned:
         return learned_table(tests)
+    if options.untrained:
+        return untrained_table(tests)
     return ledger_table(tests, None if options.only is None else find_task(options.only).id, options.to)
 
 

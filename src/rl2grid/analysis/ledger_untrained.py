@@ -1,0 +1,67 @@
+"""What survives without learning: doing nothing, the heuristics alone, greedy search and plans, a row per task."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from rl2grid.analysis.ledger_overview import DO_NOTHING, PLANNER, USUAL_MONTHS, best_row, by_task
+from rl2grid.analysis.ledger_table import LedgerRow
+from rl2grid.analysis.table import markdown_row
+from rl2grid.envs.tasks import short_id
+from rl2grid.records.ledger import HashedTest
+from rl2grid.records.statistics import aggregated
+
+ALONE: Mapping[str, str | None] = {"do nothing": None, "`recovery`": "recovery", "`careful`": "careful"}
+"""Heuristics under which nobody acts: a grid has one value of each, as none of what its tasks offer is chosen."""
+ACTING = {"greedy search": "greedy", "planner": PLANNER, "rehearsal": "rehearsal"}
+"""Agents, of which each cell has the heuristic by which they survive longest."""
+
+Milliseconds = Mapping[tuple[str, str, str | None], float]
+"""Of a decision, by task (in short), agent and heuristic."""
+
+
+def untrained_table(results: Mapping[str, HashedTest], milliseconds: Milliseconds | None = None) -> str:
+    """Mean survival of who learns nothing, as Markdown; the best of a row is bold.
+
+    Args:
+        results: of a ledger.
+        milliseconds: what a decision takes, shown where it is known.
+    """
+    rows = by_task(results)
+    columns = ["task", *ALONE, *ACTING]
+    lines = [markdown_row(columns), "|" + ":--|" * len(columns)]
+    for task, of_task in rows.items():
+        of_grid = [row for other, found in rows.items() if _grid(other) == _grid(task) for row in found]
+        cells = [_with_most_months(of_grid, heuristic) for heuristic in ALONE.values()]
+        cells += [best_row([row for row in of_task if row.first.agent == agent]) for agent in ACTING.values()]
+        highest = max((_survival(row) for row in cells if row is not None), default=None)
+        lines.append(markdown_row([short_id(task), *(_cell(row, highest, milliseconds or {}) for row in cells)]))
+    return "\n".join(lines)
+
+
+def _grid(task: str) -> str:
+    return short_id(task).rpartition("-")[0]
+
+
+def _with_most_months(rows: Sequence[LedgerRow], heuristic: str | None) -> LedgerRow | None:
+    alone = [row for row in rows if row.first.agent == DO_NOTHING and row.first.heuristic == heuristic]
+    return max(alone, key=lambda row: int(row.first.months["number"]), default=None)
+
+
+def _survival(row: LedgerRow) -> float:
+    return aggregated(row.scores("survival"))
+
+
+def _cell(row: LedgerRow | None, highest: float | None, milliseconds: Milliseconds) -> str:
+    if row is None:
+        return ""
+    test, survival = row.first, f"{_survival(row):.3f}"
+    words = [f"**{survival}**" if _survival(row) == highest else survival]
+    remarks = []
+    if test.agent != DO_NOTHING:
+        words += [f"`{test.heuristic}`"] if test.heuristic else []
+        took = milliseconds.get((short_id(test.task), test.agent, test.heuristic))
+        remarks += [] if took is None else [f"{took:.2g} ms"]
+    months = int(test.months["number"])
+    remarks += [f"{months} months"] if months != USUAL_MONTHS else []
+    return " ".join(words) + (f" ({', '.join(remarks)})" if remarks else "")
