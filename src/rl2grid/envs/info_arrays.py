@@ -69,10 +69,7 @@ class InfoForm:
     def __init__(self, words: Sequence[str], tells_discounted: bool, n: int) -> None:
         names = [_COUNTS, _FLAGS, _NUMBERS]
         self._keys = [*words, *(lines[line] for lines in names for line in range(len(lines))), "attacked_lines"]
-        self._dicts = [
-            (key, slice(first, first + len(entries)), entries, _beside_masks(entries))
-            for first, (key, entries) in _DICTS.items()
-        ]
+        self._dicts = [(key, first, entries, _beside_masks(entries)) for first, (key, entries) in _DICTS.items()]
         self._all = _beside_masks((*self._keys, *(key for key, *_ in self._dicts)))
         self._tells_discounted = tells_discounted
         everybody = np.ones(n, np.bool_)
@@ -91,13 +88,14 @@ class InfoForm:
         blank = self._blank if told is None else self._blank_of(told)
         infos, numbers = blank.infos.copy(), list(report.numbers)
         values = (*words, *report.counts, *report.flags, *numbers[: len(_NUMBERS)], report.attacked)
-        # Assigned one by one: for so few that is faster than to update.
+        # Assigned one by one: for so few that is faster than to update, or to take slices.
         for key, value in zip(self._keys, values, strict=True):
             infos[key] = value
-        for (key, lines, entries, _), masks in zip(self._dicts, blank.dicts, strict=True):
+        for (key, line, entries, _), masks in zip(self._dicts, blank.dicts, strict=True):
             infos[key] = entries_of = masks.copy()
-            for entry, value in zip(entries, numbers[lines], strict=True):
-                entries_of[entry] = value
+            for entry in entries:
+                entries_of[entry] = numbers[line]
+                line += 1
         if not self._tells_discounted:
             del infos["discounted_reward"], infos["_discounted_reward"]
         return infos

@@ -80,7 +80,7 @@ _ABREAST = 16
 side, because the topologies of rows differ. More, and a thread still has many when the others are done."""
 
 
-@dataclass(frozen=True)
+@dataclass(slots=True)  # not frozen, which takes a microsecond of every step
 class Commands:
     """What the agents of several environments do, one entry each, some of the changes that all refer to."""
 
@@ -211,6 +211,9 @@ class NativeTransitions(Transitions):
     def __post_init__(self) -> None:
         n = len(self.engine.state.step)
         self._reward_code = _COMPILED_IN.get(self.reward.components)
+        survive, overload, cost = map(float, self.reward.weights)
+        self._weights = survive, overload, cost
+        self._heuristic_code = _CODES[self.heuristic, changes_topology(self.kind)] if self.heuristic else ALONE
         self._threads = Threads(os.cpu_count() or 1, "rl2grid")
         self._rows = np.arange(n)
         self._no_effects = np.full(n, "", object)
@@ -368,7 +371,6 @@ class NativeTransitions(Transitions):
     def _advance_some(
         self, thread: int, rows: I64, order: I64, counter: I64, abreast: int, commands: Commands, begins: bool
     ) -> None:
-        weights = self.reward.weights
         advance(
             *self._addresses(thread),
             rows,
@@ -383,16 +385,11 @@ class NativeTransitions(Transitions):
             commands.masks,
             commands.injects,
             commands.values,
-            self._heuristic_code(),
+            self._heuristic_code,
             self._reward_code or DEFAULT,
-            (float(weights[0]), float(weights[1]), float(weights[2])),
+            self._weights,
             float(self.gamma),
         )
-
-    def _heuristic_code(self) -> int:
-        if self.heuristic is None:
-            return ALONE
-        return _CODES[self.heuristic, changes_topology(self.kind)]
 
 
 def _parts(n_rows: int, num_threads: int) -> int:
