@@ -20,17 +20,16 @@ os.environ["OPENBLAS_NUM_THREADS"] = "1"
 os.environ["OMP_NUM_THREADS"] = "1"
 
 import numpy as np
-from gains import CHOSEN_ON
+from gains import CHOSEN_ON, validation_months
 from timed import Timed
 
 from rl2grid.agents.agent import Agent
 from rl2grid.envs.tasks import Task, find_task, short_id
 from rl2grid.evaluation.agents import AGENTS, make_agent
-from rl2grid.evaluation.protocol import AS_TRAINED, evaluate, first_months
+from rl2grid.evaluation.protocol import AS_TRAINED, evaluate
 from rl2grid.records.files import write_json
 from rl2grid.records.versions import processor
 from rl2grid.scenarios.episodes import MAX_STEPS
-from rl2grid.scenarios.splits import VALIDATION
 
 RESULTS = Path(__file__).resolve().parent / "results" / "decision_time.json"
 
@@ -76,7 +75,7 @@ def main() -> None:
     parser.add_argument("--skip", type=int, default=CHOSEN_ON)
     arguments = parser.parse_args()
     task = find_task(arguments.task)
-    months = first_months(task, VALIDATION, arguments.skip + arguments.months)[arguments.skip :]
+    months = validation_months(task, arguments.skip, arguments.months)
     rows: dict[str, Any] = {}
     for name, (agent, heuristic) in players(arguments.agents, task, arguments.top_k).items():
         rows[name] = row_of(agent, task, heuristic, months)

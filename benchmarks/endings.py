@@ -22,13 +22,13 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gains import validation_months
 
 import rl2grid  # noqa: F401  (registers the tasks)
 from rl2grid.agents.agent import Action, Agent
 from rl2grid.envs.tasks import find_task, short_id
 from rl2grid.evaluation.agents import make_agent
 from rl2grid.evaluation.episode import play_episode
-from rl2grid.evaluation.protocol import first_months
 from rl2grid.mdp.state import GridState
 from rl2grid.records.files import write_json
 from rl2grid.scenarios.splits import VALIDATION
@@ -113,7 +113,7 @@ def ends_of(task_id: str, word: str, skip: int, months: int) -> dict[str, Any]:
     env = gymnasium.make(task.id, split=VALIDATION, heuristic=heuristic or None, disable_env_checker=True)
     witness.bind(env)
     lost = []
-    for scenario in first_months(task, VALIDATION, skip + months)[skip:]:
+    for scenario in validation_months(task, skip, months):
         witness.crisis, witness._out = None, None
         episode = play_episode(witness, env, scenario=scenario, seed=0)
         print(short_id(task.id), word, scenario, round(episode.survival, 3), witness.crisis, flush=True)

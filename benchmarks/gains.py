@@ -14,7 +14,8 @@ import numpy as np
 
 import rl2grid
 from rl2grid.agents.agent import Agent
-from rl2grid.envs.tasks import find_task
+from rl2grid.envs.tasks import Task, find_task
+from rl2grid.evaluation.protocol import first_months
 from rl2grid.records.comparisons import paired_differences
 from rl2grid.records.statistics import UNIT, Estimate, Scores, estimate
 from rl2grid.scenarios.library import list_scenarios
@@ -22,6 +23,11 @@ from rl2grid.scenarios.splits import VALIDATION
 
 CHOSEN_ON = 20
 """Validation months by which the best policy of a training is kept."""
+
+
+def validation_months(task: Task, skip: int, months: int) -> tuple[str, ...]:
+    """The ``months`` validation months behind the first ``skip``."""
+    return first_months(task, VALIDATION, skip + months)[skip:]
 
 
 def survival_behind(agent: Agent | Path, task_id: str, months: int | None = None) -> list[float]:

@@ -17,17 +17,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from gains import validation_months
 from timed import Timed
 
 from rl2grid.agents.agent import Agent
 from rl2grid.agents.planner import INGREDIENTS, Planner
 from rl2grid.envs.tasks import Task, find_task, short_id
 from rl2grid.evaluation.agents import make_agent
-from rl2grid.evaluation.protocol import evaluate, first_months
+from rl2grid.evaluation.protocol import evaluate
 from rl2grid.records.comparisons import paired_differences
 from rl2grid.records.files import write_json
 from rl2grid.records.statistics import Scores
-from rl2grid.scenarios.splits import VALIDATION
 
 RESULTS = Path(__file__).resolve().parent / "results" / "planner.json"
 
@@ -77,7 +77,7 @@ def main() -> None:
     arguments = parser.parse_args()
     for name in arguments.tasks:
         task = find_task(name)
-        months = first_months(task, VALIDATION, arguments.skip + arguments.months)[arguments.skip :]
+        months = validation_months(task, arguments.skip, arguments.months)
         agents = [Planner(), *(make_agent(other, task) for other in arguments.against)]
         if arguments.without:
             agents += [Planner(without=[each]) for each in INGREDIENTS]

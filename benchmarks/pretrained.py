@@ -13,6 +13,8 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 
+from gains import validation_months
+
 from rl2grid.agents.agent import Agent
 from rl2grid.algorithms.checkpoint import load_checkpoint, save_checkpoint
 from rl2grid.algorithms.policy_agent import BEST_FILE, load_agent
@@ -21,9 +23,8 @@ from rl2grid.algorithms.top_k import TopK
 from rl2grid.envs.tasks import Task, short_id
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import make_agent
-from rl2grid.evaluation.protocol import evaluate, first_months
+from rl2grid.evaluation.protocol import evaluate
 from rl2grid.records.files import write_json
-from rl2grid.scenarios.splits import VALIDATION
 from rl2grid.training.request import read_config
 
 
@@ -53,7 +54,7 @@ def main() -> None:
     args, _ = read_config(options.run)
     task, heuristic = args.task, args.env_keywords["heuristic"]
     contents = load_checkpoint(options.run / BEST_FILE)
-    months = first_months(task, VALIDATION, options.skip + options.months)[options.skip :]
+    months = validation_months(task, options.skip, options.months)
     policy = load_agent(options.run, name=f"pretrained-{options.name}")
     agents: list[Agent] = [policy]
     if options.top_k is not None:
