@@ -37,7 +37,7 @@ def test_who_does_nothing_has_one_value_on_a_grid_and_others_their_best_heuristi
 
 
 def test_time_stands_beside_the_very_row_that_was_timed() -> None:
-    milliseconds = {("bus14-T0", "greedy", None): 3.0, ("bus14-T0", "planner", None): 24.661}
+    milliseconds = {("bus14-T0", "greedy", None): (3.0, 9.0), ("bus14-T0", "planner", None): (4.698, 24.661)}
     line = untrained_table(RESULTS, milliseconds).splitlines()[2]
     assert "0.700 `idle` (2 months)" in line
-    assert "**0.800** (25 ms, 2 months)" in line
+    assert "**0.800** (4.7, 25 ms, 2 months)" in line

@@ -16,8 +16,8 @@ ALONE: Mapping[str, str | None] = {"do nothing": None, "`recovery`": "recovery",
 ACTING = {"greedy search": "greedy", "planner": PLANNER, "rehearsal": "rehearsal"}
 """Agents, of which each cell has the heuristic by which they survive longest."""
 
-Milliseconds = Mapping[tuple[str, str, str | None], float]
-"""Of a decision, by task (in short), agent and heuristic."""
+Milliseconds = Mapping[tuple[str, str, str | None], tuple[float, float]]
+"""Within which half of the decisions are made and 99 of 100, by task (in short), agent and heuristic."""
 
 
 def untrained_table(results: Mapping[str, HashedTest], milliseconds: Milliseconds | None = None) -> str:
@@ -25,7 +25,7 @@ def untrained_table(results: Mapping[str, HashedTest], milliseconds: Millisecond
 
     Args:
         results: of a ledger.
-        milliseconds: what a decision takes, shown where it is known.
+        milliseconds: what decisions take, shown where it is known.
     """
     rows = by_task(results)
     columns = ["task", *ALONE, *ACTING]
@@ -61,7 +61,7 @@ def _cell(row: LedgerRow | None, highest: float | None, milliseconds: Millisecon
     if test.agent != DO_NOTHING:
         words += [f"`{test.heuristic}`"] if test.heuristic else []
         took = milliseconds.get((short_id(test.task), test.agent, test.heuristic))
-        remarks += [] if took is None else [f"{took:.2g} ms"]
+        remarks += [] if took is None else [f"{took[0]:.2g}, {took[1]:.2g} ms"]
     months = int(test.months["number"])
     remarks += [f"{months} months"] if months != USUAL_MONTHS else []
     return " ".join(words) + (f" ({', '.join(remarks)})" if remarks else "")
