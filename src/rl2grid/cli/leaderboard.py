@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 _SUBJECT = "a run folder, pretrained/NAME, or an agent without training as greedy@bus14-T0 or random@bus14-T0:idle"
 _OF_ALL_TASKS = "best", "learned", "untrained"
+"""Flags of the tables of a ledger that have a row per task."""
 DIFFERENT = 1
 """Exit status when an entry is not what its actions make."""
 
