@@ -81,7 +81,8 @@ _SETTINGS = (
 def included_studies() -> dict[str, Path]:
     """The studies of this package, by name."""
     folder = Path(str(resources.files("rl2grid"))) / "studies"
-    return {path.stem: path for path in sorted(folder.glob("*.toml"))}
+    paths = {path.stem: path for path in folder.glob("*.toml")}
+    return dict(sorted(paths.items()))
 
 
 def load_study(file: str, scale: str | None = None, output: Path | None = None) -> Study:
