@@ -40,11 +40,11 @@ RESULTS = Path(__file__).resolve().parent / "results" / "endings.json"
 class Crisis:
     """From the last step without an overload to the end of the episode."""
 
-    lost: str = "demand"
+    lost: str
     """What went out of service in the step in which it began."""
-    step: int = 0
+    step: int
     """In which it began."""
-    loading: float = 0.0
+    loading: float
     """The largest then."""
     best: float | None = None
     """What the best single action would have left."""
@@ -70,16 +70,16 @@ class Witness:
         self._env.step_listeners.append(self.hear)
         self.agent.bind(env)
 
-    def reset(self, i: int) -> None:
-        """A new episode begins."""
-        self.agent.reset(i)
-
     def hear(self, state: GridState, row: int) -> None:
         """Note a grid step that was really played; that of a game over shows nothing."""
-        if self._env.imagined or state.terminated[row]:
+        if self._env.imagined:
+            return
+        if state.step[row] == 0:
+            self.crisis, self._out = None, None
+        if state.terminated[row]:
             return
         out = {"attack": state.attacked[row].copy(), "maintenance": state.time_next_maintenance[row] == 0}
-        before, self._out = (self._out if state.step[row] > 0 else None), out
+        before, self._out = self._out, out
         loading = float(state.rho[row].max())
         if loading <= 1.0:
             self.crisis = None
@@ -114,12 +114,11 @@ def ends_of(task_id: str, word: str, skip: int, months: int) -> dict[str, Any]:
     witness.bind(env)
     lost = []
     for scenario in validation_months(task, skip, months):
-        witness.crisis, witness._out = None, None
         episode = play_episode(witness, env, scenario=scenario, seed=0)
         print(short_id(task.id), word, scenario, round(episode.survival, 3), witness.crisis, flush=True)
         if episode.completed:
             continue
-        crisis = witness.crisis or Crisis("nothing: the grid was safe", episode.grid_steps)
+        crisis = witness.crisis or Crisis("nothing: the grid was safe", episode.grid_steps, 0.0)
         lost.append(
             {
                 "month": scenario,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from sample_results import TASK, result
@@ -31,6 +32,11 @@ def trained(
     ]
     assert played[0] is not None
     return hashed_test({**configuration, **changes}, training, played[0], played[1])
+
+
+def on(task: str, test: HashedTest, **changes: Any) -> HashedTest:
+    """The same test on another task, and what else of its configuration is to be another."""
+    return replace(test, configuration={**test.configuration, "task": task, **changes})
 
 
 def ledger(*results: HashedTest) -> dict[str, HashedTest]:

@@ -2,18 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
-from sample_ledger import ledger, trained, untrained
+from sample_ledger import ledger, on, trained, untrained
 
 from rl2grid.analysis.ledger_learned import learned_table
 from rl2grid.errors import UsageError
-from rl2grid.records.ledger import HashedTest
-
-
-def on(task: str, test: HashedTest) -> HashedTest:
-    return replace(test, configuration={**test.configuration, "task": task})
 
 
 def test_methods_of_several_trainings_are_compared_on_the_months_that_all_played():

@@ -2,16 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
-from sample_ledger import ledger, trained, untrained
+from sample_ledger import ledger, on, trained, untrained
 
 from rl2grid.analysis.ledger_overview import overview_table
-from rl2grid.records.ledger import HashedTest
-
-
-def on(task: str, test: HashedTest) -> HashedTest:
-    return replace(test, configuration={**test.configuration, "task": task})
 
 
 def test_each_kind_shows_its_best_and_the_best_of_a_task_is_bold():

@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
-from sample_ledger import ledger, trained, untrained
+from sample_ledger import ledger, on, trained, untrained
 
 from rl2grid.analysis.ledger_untrained import untrained_table
-from rl2grid.records.ledger import HashedTest
 
-
-def of(test: HashedTest, task: str, heuristic: str | None = None) -> HashedTest:
-    return replace(test, configuration={**test.configuration, "task": f"rl2grid/{task}-v0", "heuristic": heuristic})
-
+BUS14 = "rl2grid/bus14-T0-v0"
 
 RESULTS = ledger(
-    of(untrained("do-nothing", [0.1, 0.2]), "bus14-T0"),
-    of(untrained("do-nothing", [0.2, 0.2]), "bus14-T0", "careful"),
-    of(untrained("do-nothing", [0.1, 0.2, 0.6]), "bus14-R"),
-    of(untrained("greedy", [0.6, 0.7]), "bus14-T0"),
-    of(untrained("greedy", [0.7, 0.7]), "bus14-T0", "idle"),
-    of(untrained("planner", [0.9, 0.7]), "bus14-T0"),
+    on(BUS14, untrained("do-nothing", [0.1, 0.2])),
+    on(BUS14, untrained("do-nothing", [0.2, 0.2]), heuristic="careful"),
+    on("rl2grid/bus14-R-v0", untrained("do-nothing", [0.1, 0.2, 0.6])),
+    on(BUS14, untrained("greedy", [0.6, 0.7])),
+    on(BUS14, untrained("greedy", [0.7, 0.7]), heuristic="idle"),
+    on(BUS14, untrained("planner", [0.9, 0.7])),
     trained(1, [1.0, 1.0]),
-    of(untrained("rehearsal", [0.4, 0.5]), "bus36-M-T1"),
+    on("rl2grid/bus36-M-T1-v0", untrained("rehearsal", [0.4, 0.5])),
 )
 
 

@@ -30,7 +30,7 @@ def overview_table(results: Mapping[str, HashedTest]) -> str:
     lines = [markdown_row(["task", *KINDS]), "|:--|" + ":--|" * len(KINDS)]
     for task, rows in by_task(results).items():
         best = [best_row([row for row in rows if kind_of(row.first) == kind]) for kind in KINDS]
-        highest = max(_survival(row) for row in best if row is not None)
+        highest = max(survival_of(row) for row in best if row is not None)
         lines.append(markdown_row([short_id(task), *(_cell(row, highest) for row in best)]))
     return "\n".join(lines)
 
@@ -55,24 +55,29 @@ def kind_of(result: HashedTest) -> str:
 
 def best_row(rows: Sequence[LedgerRow]) -> LedgerRow | None:
     """The row of the highest mean survival; None: there is no row."""
-    return max(rows, key=_survival, default=None)
+    return max(rows, key=survival_of, default=None)
 
 
-def _survival(row: LedgerRow) -> float:
+def survival_of(row: LedgerRow) -> float:
+    """Mean survival, over trainings and months."""
     return aggregated(row.scores("survival"))
 
 
 def _cell(row: LedgerRow | None, highest: float) -> str:
     if row is None:
         return ""
-    survival = f"{_survival(row):.3f}"
-    shown = f"**{survival}**" if _survival(row) == highest else survival
-    label = "" if row.first.label in (DO_NOTHING, PLANNER) else f" {row.first.label}"
-    remarks = ", ".join(_remarks(row))
-    return shown + label + (f" ({remarks})" if remarks else "")
+    label = "" if row.first.label in (DO_NOTHING, PLANNER) else row.first.label
+    return survival_cell(row, highest, label, remarks_on(row))
 
 
-def _remarks(row: LedgerRow) -> list[str]:
+def survival_cell(row: LedgerRow, highest: float, label: str, remarks: Sequence[str]) -> str:
+    """Mean survival, bold if it is the highest of its line, who it is, and remarks in brackets."""
+    survival = f"{survival_of(row):.3f}"
+    shown = f"**{survival}**" if survival_of(row) == highest else survival
+    return " ".join([shown, *([label] if label else []), *([f"({', '.join(remarks)})"] if remarks else [])])
+
+
+def remarks_on(row: LedgerRow) -> list[str]:
     """How many trainings, and how many months where these are not all of the list."""
     number, months = len(row.results), int(row.first.months["number"])
     trainings = [f"{number} training{'s' if number > 1 else ''}"] if row.first.training else []

@@ -4,12 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from rl2grid.analysis.ledger_overview import DO_NOTHING, PLANNER, USUAL_MONTHS, best_row, by_task
+from rl2grid.analysis.ledger_overview import (
+    DO_NOTHING,
+    PLANNER,
+    best_row,
+    by_task,
+    remarks_on,
+    survival_cell,
+    survival_of,
+)
 from rl2grid.analysis.ledger_table import LedgerRow
 from rl2grid.analysis.table import markdown_row
 from rl2grid.envs.tasks import short_id
 from rl2grid.records.ledger import HashedTest
-from rl2grid.records.statistics import aggregated
 
 ALONE: Mapping[str, str | None] = {"do nothing": None, "`recovery`": "recovery", "`careful`": "careful"}
 """Heuristics under which nobody acts: a grid has one value of each, as none of what its tasks offer is chosen."""
@@ -34,7 +41,7 @@ def untrained_table(results: Mapping[str, HashedTest], milliseconds: Millisecond
         of_grid = [row for other, found in rows.items() if _grid(other) == _grid(task) for row in found]
         cells = [_with_most_months(of_grid, heuristic) for heuristic in ALONE.values()]
         cells += [best_row([row for row in of_task if row.first.agent == agent]) for agent in ACTING.values()]
-        highest = max((_survival(row) for row in cells if row is not None), default=None)
+        highest = max((survival_of(row) for row in cells if row is not None), default=0.0)
         lines.append(markdown_row([short_id(task), *(_cell(row, highest, milliseconds or {}) for row in cells)]))
     return "\n".join(lines)
 
@@ -48,20 +55,12 @@ def _with_most_months(rows: Sequence[LedgerRow], heuristic: str | None) -> Ledge
     return max(alone, key=lambda row: int(row.first.months["number"]), default=None)
 
 
-def _survival(row: LedgerRow) -> float:
-    return aggregated(row.scores("survival"))
-
-
-def _cell(row: LedgerRow | None, highest: float | None, milliseconds: Milliseconds) -> str:
+def _cell(row: LedgerRow | None, highest: float, milliseconds: Milliseconds) -> str:
     if row is None:
         return ""
-    test, survival = row.first, f"{_survival(row):.3f}"
-    words = [f"**{survival}**" if _survival(row) == highest else survival]
-    remarks = []
-    if test.agent != DO_NOTHING:
-        words += [f"`{test.heuristic}`"] if test.heuristic else []
-        took = milliseconds.get((short_id(test.task), test.agent, test.heuristic))
-        remarks += [] if took is None else [f"{took[0]:.2g}, {took[1]:.2g} ms"]
-    months = int(test.months["number"])
-    remarks += [f"{months} months"] if months != USUAL_MONTHS else []
-    return " ".join(words) + (f" ({', '.join(remarks)})" if remarks else "")
+    test = row.first
+    if test.agent == DO_NOTHING:  # its column says the heuristic, and it takes no time
+        return survival_cell(row, highest, "", remarks_on(row))
+    took = milliseconds.get((short_id(test.task), test.agent, test.heuristic))
+    times = [] if took is None else [f"{took[0]:.2g}, {took[1]:.2g} ms"]
+    return survival_cell(row, highest, f"`{test.heuristic}`" if test.heuristic else "", [*times, *remarks_on(row)])

@@ -79,14 +79,15 @@ class EpisodeTable:
         self._numbers[rows] = positions.numbers
         if positions.options or self._options:
             for i in rows.tolist():
-                self._options[i] = positions.options
+                self._note_options(i, positions.options)
 
     def take_one(self, i: int, plan: EpisodePlan, grid_steps: int, options: Mapping[str, Any]) -> None:
         """Note what row ``i`` plays now; see :class:`StreamPositions`."""
         self.begun[i] = True
         self.scenarios[i] = plan.scenario_id
         self.counts[:, i] = plan.start, plan.redraws, grid_steps
-        self._seeds[i], self._numbers[i], self._options[i] = plan.seed, plan.number, options
+        self._seeds[i], self._numbers[i] = plan.seed, plan.number
+        self._note_options(i, options)
 
     def plan(self, i: int, n_steps: int) -> EpisodePlan:
         """What was decided of the episode of row ``i``, which is completed after ``n_steps`` steps."""
@@ -107,6 +108,12 @@ class EpisodeTable:
     def options(self, i: int) -> Mapping[str, Any]:
         """With which the episode of row ``i`` was asked for."""
         return self._options.get(i, {})
+
+    def _note_options(self, i: int, options: Mapping[str, Any]) -> None:
+        if options:
+            self._options[i] = options
+        else:
+            self._options.pop(i, None)
 
 
 def _unnamed_seed() -> int:

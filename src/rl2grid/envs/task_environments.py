@@ -211,7 +211,6 @@ class TaskEnvironments:
 
     def clock(self, i: int, step: int) -> datetime:
         """The time in the scenario after ``step`` steps of the episode of row ``i``."""
-        self._check_begun(i)
         return self._beginning(i) + step * STEP
 
     def what_if(self, i: int, actions: Sequence[int] | None) -> ActionOutcomes:

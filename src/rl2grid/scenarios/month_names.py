@@ -51,3 +51,8 @@ def name_of(months: Months) -> str:
     """The opposite of :func:`parse_months`."""
     name = month_name(months.seed, months.first)
     return name if months.n_months == 1 else f"{name}+{months.first + 1:02d}"
+
+
+def scenario_id_of(months: Months) -> str:
+    """Of the scenario that they are, for example ``generated/17-03+04``."""
+    return f"generated/{name_of(months)}"

@@ -15,7 +15,7 @@ from rl2grid.grids.systems import Scenarios, Series
 from rl2grid.scenarios.fingerprint import VERSION
 from rl2grid.scenarios.full import is_full_requested
 from rl2grid.scenarios.generated import load_generated
-from rl2grid.scenarios.month_names import name_of, parse_months
+from rl2grid.scenarios.month_names import parse_months, scenario_id_of
 from rl2grid.scenarios.splits import (
     BUNDLED,
     FIRST_TRAINING_SEED,
@@ -72,7 +72,7 @@ class GeneratedScenarios:
         if not _is_generated(split):
             return self.recorded.draw(grid, split, seed, number)
         if split == TRAIN:
-            return f"{GENERATED}/{name_of(draw_training_months(seed, number))}"
+            return scenario_id_of(draw_training_months(seed, number))
         return draw_listed(self.listed(grid, split), split, seed, number)
 
     def load(self, grid: Grid, source: str, name: str) -> Series:
@@ -83,7 +83,7 @@ class GeneratedScenarios:
             return self.recorded.sample(grid, split)
         if split != TRAIN:
             return "", self.listed(grid, split)
-        return f"library {LIBRARY_VERSION}\n", (f"{GENERATED}/{name_of(draw_training_months(0, 0))}",)
+        return f"library {LIBRARY_VERSION}\n", (scenario_id_of(draw_training_months(0, 0)),)
 
     def maintenance(self, grid: Grid, source: str) -> MaintenanceConfig:
         if source != GENERATED:

@@ -38,7 +38,7 @@ from rl2grid.scenarios.generator.constants import load_constants
 from rl2grid.scenarios.generator.forecast import ForecastModel, forecast_model, forecast_row
 from rl2grid.scenarios.generator.month import RawMonth, month_of_year
 from rl2grid.scenarios.generator.year import YEAR_LENGTH, generate_year
-from rl2grid.scenarios.month_names import Months, name_of
+from rl2grid.scenarios.month_names import Months, scenario_id_of
 from rl2grid.scenarios.splits import TRAINING_SEEDS, TRAINING_YEARS
 
 _ARRAYS = ("load_p", "load_q", "prod_p")
@@ -80,7 +80,7 @@ class TrainingMonths:
     @functools.cached_property
     def id(self) -> str:
         """For example ``generated/1000017-03+04``."""
-        return f"generated/{name_of(self.months)}"
+        return scenario_id_of(self.months)
 
     @property
     def n_steps(self) -> int:

@@ -81,8 +81,7 @@ _SETTINGS = (
 def included_studies() -> dict[str, Path]:
     """The studies of this package, by name."""
     folder = Path(str(resources.files("rl2grid"))) / "studies"
-    paths = {path.stem: path for path in folder.glob("*.toml")}
-    return dict(sorted(paths.items()))
+    return {path.stem: path for path in sorted(folder.glob("*.toml"), key=lambda path: path.stem)}
 
 
 def load_study(file: str, scale: str | None = None, output: Path | None = None) -> Study:

@@ -16,7 +16,7 @@ from rl2grid.scenarios.cache import data_folder
 from rl2grid.scenarios.generator.calendar import MONTH_STEPS, month_start
 from rl2grid.scenarios.generator.constants import load_constants
 from rl2grid.scenarios.making import make_library_beside
-from rl2grid.scenarios.month_names import MONTHS, Months, name_of
+from rl2grid.scenarios.month_names import MONTHS, Months, scenario_id_of
 from rl2grid.scenarios.outage_draws import most_outages, outage_model
 from rl2grid.scenarios.splits import FIRST_TRAINING_SEED, TRAINING_YEARS
 from rl2grid.scenarios.training_years import TrainingMonths, TrainingYear, forecasts_of, training_year
@@ -57,10 +57,7 @@ class TrainingLibrary:
         self.most_outages = most_outages(outages)
         """No episode has more."""
         self.scenario_ids = np.array(
-            [
-                [f"generated/{name_of(_months(year, month))}" for month in range(MONTHS - 1)]
-                for year in range(TRAINING_YEARS)
-            ],
+            [[scenario_id_of(_months(year, month)) for month in range(MONTHS - 1)] for year in range(TRAINING_YEARS)],
             object,
         )
         """Of each year and each first of two months, object [year, month]."""
