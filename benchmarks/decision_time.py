@@ -1,11 +1,11 @@
 """What a decision costs, and how many there are in a month: agents on the same validation months, one thread.
 
-``python benchmarks/decision_time.py TASK AGENT[:HEURISTIC] ... [--top-k K] [--months N] [--skip N]`` plays validation
+``python benchmarks/decision_time.py TASK AGENT[:HEURISTIC] ... [--top-k K] [--rehearse STEPS]`` plays validation
 months of a task, by default ten behind those by which policies were picked, with each agent: ``planner``,
-``greedy:careful``, a run folder or ``pretrained/NAME`` (with the heuristic of its training), and, with ``--top-k``,
-the best K of every policy. It adds to ``benchmarks/results/decision_time.json`` a row for each: survival, decisions a
-month, milliseconds of processor time of a decision (mean, median, 99 of 100) and seconds of them in a month of 8,064
-steps that were played.
+``greedy:careful``, a run folder or ``pretrained/NAME`` (with the heuristic of its training), and, with ``--top-k`` or
+``--rehearse``, every policy once more looking so before it acts. It writes to
+``benchmarks/results/decision_time.json`` a row for each: survival, decisions a month, milliseconds of processor time
+of a decision (mean, median, 99 of 100) and seconds of them in a month of 8,064 steps that were played.
 """
 
 from __future__ import annotations
@@ -24,10 +24,12 @@ from gains import CHOSEN_ON, validation_months
 from timed import Timed
 
 from rl2grid.agents.agent import Agent
+from rl2grid.cli.keywords import add_looking, looking
 from rl2grid.envs.tasks import Task, find_task, short_id
 from rl2grid.evaluation.agents import AGENTS, make_agent
 from rl2grid.evaluation.protocol import AS_TRAINED, evaluate
 from rl2grid.records.files import write_json
+from rl2grid.records.ledger import looking_of
 from rl2grid.records.versions import processor
 from rl2grid.scenarios.episodes import MAX_STEPS
 
@@ -51,7 +53,7 @@ def row_of(agent: Agent, task: Task, heuristic: str | None, months: tuple[str, .
     }
 
 
-def players(words: list[str], task: Task, top_k: int | None) -> dict[str, tuple[Agent, str | None]]:
+def players(words: list[str], task: Task, look: dict[str, int]) -> dict[str, tuple[Agent, str | None]]:
     """Agents and heuristics by the names of their rows."""
     found: dict[str, tuple[Agent, str | None]] = {}
     for word in words:
@@ -60,8 +62,8 @@ def players(words: list[str], task: Task, top_k: int | None) -> dict[str, tuple[
             found[word] = make_agent(name, task), heuristic or None
             continue
         found[name] = make_agent(name, task), AS_TRAINED
-        if top_k is not None:
-            found[f"{name}, best of {top_k}"] = make_agent(name, task, top_k=top_k), AS_TRAINED
+        if look:
+            found[f"{name}{looking_of(look)}"] = make_agent(name, task, **look), AS_TRAINED
     return found
 
 
@@ -70,14 +72,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("task", metavar="TASK")
     parser.add_argument("agents", nargs="+", metavar="AGENT")
-    parser.add_argument("--top-k", type=int, default=None)
+    add_looking(parser)
     parser.add_argument("--months", type=int, default=10)
     parser.add_argument("--skip", type=int, default=CHOSEN_ON)
     arguments = parser.parse_args()
     task = find_task(arguments.task)
     months = validation_months(task, arguments.skip, arguments.months)
     rows: dict[str, Any] = {}
-    for name, (agent, heuristic) in players(arguments.agents, task, arguments.top_k).items():
+    for name, (agent, heuristic) in players(arguments.agents, task, looking(arguments)).items():
         rows[name] = row_of(agent, task, heuristic, months)
         print(short_id(task.id), name, json.dumps(rows[name]), flush=True)
     results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}

@@ -1,8 +1,9 @@
-"""What it costs, and what it gains, to look before acting: policies whose best K actions the what-if compares.
+"""What it costs, and what it gains, to look before acting: the what-if, or rehearsals of crises.
 
-``python benchmarks/top_k.py RUN [RUN ...] [--k 1 3 10 ...] [--months M]`` plays the best policy of each training
-with each K on M validation months behind the first 20, by which it was picked, and adds survival, paired gains and
-processor time of a decision to ``benchmarks/results/top_k.json``. Test months are never played.
+``python benchmarks/top_k.py RUN [RUN ...] [--k 3 10 ...] [--rehearse 24 ...] [--months M]`` plays the best policy of
+each training as it is, with the what-if among its best K actions, and with crises rehearsed for so many steps, on M
+validation months behind the first 20, by which it was picked, and adds survival, paired gains and processor time of a
+decision to ``benchmarks/results/top_k.json``. Test months are never played.
 """
 
 from __future__ import annotations
@@ -29,10 +30,10 @@ from rl2grid.records.versions import processor
 RESULTS = Path(__file__).resolve().parent / "results" / "top_k.json"
 
 
-def play(run: str, k: int, months: int) -> tuple[list[float], dict[str, Any]]:
+def play(run: str, looking: dict[str, int], months: int) -> tuple[list[float], dict[str, Any]]:
     """Survival of each month, and what decisions cost."""
     policy = rl2grid.load(run)
-    agent = Timed(policy if k == 1 else make_agent(run, find_task(policy.task), top_k=k))
+    agent = Timed(make_agent(run, find_task(policy.task), **looking))
     survival = survival_behind(agent, policy.task, months)
     microseconds = 1e6 * float(np.mean(agent.seconds))
     return survival, {"decisions": len(agent.seconds), "microseconds": round(microseconds, 1)}
@@ -42,24 +43,28 @@ def main() -> None:
     """Play what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", nargs="+", metavar="RUN", help="trainings of one method, which differ in their seed")
-    parser.add_argument("--k", nargs="+", type=int, default=[1, 3, 10])
+    parser.add_argument("--k", nargs="*", type=int, default=[3, 10], help="best actions that the what-if compares")
+    parser.add_argument("--rehearse", nargs="*", type=int, default=[], metavar="STEPS", help="of a crisis")
     parser.add_argument("--months", type=int, default=60)
     arguments = parser.parse_args()
     first = rl2grid.load(arguments.runs[0])
     name = f"{first.name} {first.task.removeprefix('rl2grid/')} {first.env_keywords['heuristic'] or 'no heuristic'}"
     survival: dict[str, list[list[float]]] = {}
     costs: dict[str, list[dict[str, Any]]] = {}
-    for k in dict.fromkeys([1, *arguments.k]):
+    ways: dict[str, dict[str, int]] = {"1": {}}
+    ways |= {str(k): {"top_k": k} for k in arguments.k}
+    ways |= {f"rehearsing {steps}": {"rehearse": steps} for steps in arguments.rehearse}
+    for way, looking in ways.items():
         for run in arguments.runs:
-            months, cost = play(run, k, arguments.months)
-            survival.setdefault(str(k), []).append(months)
-            costs.setdefault(str(k), []).append(cost)
-            print(name, f"K = {k}", run, round(float(np.mean(months)), 3), cost, flush=True)
+            months, cost = play(run, looking, arguments.months)
+            survival.setdefault(way, []).append(months)
+            costs.setdefault(way, []).append(cost)
+            print(name, f"K = {way}", run, round(float(np.mean(months)), 3), cost, flush=True)
     found = compared(survival, "1")
-    for k, each in costs.items():
+    for way, each in costs.items():
         decisions = sum(cost["decisions"] for cost in each)
         total = sum(cost["microseconds"] * cost["decisions"] for cost in each)
-        found[k] |= {"decisions": decisions, "microseconds": round(total / decisions, 1)}
+        found[way] |= {"decisions": decisions, "microseconds": round(total / decisions, 1)}
     usual: dict[str, Any] = {"processor": processor(), "methods": {}}
     results = json.loads(RESULTS.read_text()) if RESULTS.exists() else usual
     results["methods"][name] = {"runs": len(arguments.runs), "months": arguments.months, "k": found}

@@ -45,6 +45,8 @@ def test_a_policy_that_looks_before_it_acts_plays_beside_itself(capsys, tmp_path
     [
         (["pretrained/bus14-T0", "bus14-T0", "--top-k", "0"], "top_k=0 is not allowed"),
         (["greedy", "bus14-T0", "--top-k", "3"], "leave it out for greedy"),
+        (["pretrained/bus14-T0", "bus14-T0", "--rehearse", "0"], "rehearse=0 is not allowed"),
+        (["greedy", "bus14-T0", "--rehearse", "24"], "leave it out for greedy"),
         (["genius", "bus14-T0"], "choose one of do-nothing"),
         (["do-nothing", "bus14-T0", "--against", "genius"], "choose one of do-nothing"),
         (["do-nothing", "bus14-T0", "--against", "dc-opf"], "Agent 'dc-opf' cannot play"),

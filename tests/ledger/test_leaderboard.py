@@ -271,11 +271,15 @@ def test_agents_that_are_not_found_are_asked_for(folder, tmp_path):
         make_entry(tmp_path / "mine", agent="do-nothing")
 
 
-def test_a_policy_that_looks_before_it_acts_makes_an_entry(tmp_path):
-    agent = make_agent("pretrained/bus14-T0", top_k=3)
+@pytest.mark.parametrize(
+    ("looking", "words"),
+    [({"top_k": 3}, "best of 3"), ({"top_k": 2, "rehearse": 6}, "best of 2, rehearsing 6 steps")],
+)
+def test_a_policy_that_looks_before_it_acts_makes_an_entry(tmp_path, looking, words):
+    agent = make_agent("pretrained/bus14-T0", **looking)
     evaluate(agent, "bus14-T0", scenarios=MONTHS[:1], episode_length=60, output=tmp_path / "evaluation")
     entry = make_entry(tmp_path / "evaluation", agent="pretrained/bus14-T0")
-    assert entry.label == "pretrained-bus14-T0, best of 3"
+    assert entry.label == f"pretrained-bus14-T0, {words}"
     assert verify_entry(entry) is None
     with pytest.raises(UsageError, match="is not greedy as it is now"):
         make_entry(tmp_path / "evaluation", agent="greedy")

@@ -115,6 +115,18 @@ def test_the_best_of_several_actions_is_another_configuration_of_the_same_method
         find_subject("greedy@bus14-T0", top_k=3)
 
 
+def test_a_policy_that_rehearses_its_crises_is_another_configuration_of_the_same_method(played):
+    subject = find_subject("pretrained/bus14-T0", months=2)
+    rehearsing = find_subject("pretrained/bus14-T0", months=2, top_k=3, rehearse=24)
+    assert rehearsing.digest != subject.digest
+    assert rehearsing.method == subject.method
+    assert str(rehearsing).startswith("pretrained/bus14-T0, best of 3, rehearsing 24 steps on bus14-T0")
+    assert play_test(rehearsing).label == "pretrained/bus14-T0, best of 3, rehearsing 24 steps"
+    assert played[0]["agent"].name == "pretrained-bus14-T0, best of 3, rehearsing 24 steps"
+    with pytest.raises(UsageError, match="rehearse plays the crises of a trained policy in advance"):
+        find_subject("greedy@bus14-T0", rehearse=24)
+
+
 def test_what_a_training_learned_from_counts_by_content_and_seeds_are_one_choice():
     begun = {"algorithm": "imitation", "decisions": 10, "path": "a", "policy_hash": "1"}
     labels = {"teacher": "greedy", "rounds": 1, "labels": ["f00"], "grid_hash": "0"}

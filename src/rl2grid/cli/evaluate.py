@@ -19,7 +19,7 @@ from rl2grid.cli.scoring import add_scores_flag, scored_table
 from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import make_agent
-from rl2grid.evaluation.flags import environment_flags, evaluate_command
+from rl2grid.evaluation.flags import environment_flags, evaluate_command, flag_of
 from rl2grid.evaluation.places import default_folder
 from rl2grid.evaluation.protocol import check_playable, evaluate
 from rl2grid.records.collection import LAST_POLICY
@@ -54,9 +54,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--seconds", type=float, default=None, help="that the planner may search per decision; by default unlimited"
     )
-    parser.add_argument(
-        "--top-k", type=int, default=None, help="best actions of a policy of which the what-if chooses; by default 1"
-    )
+    keywords.add_looking(parser)
     parser.add_argument("--output", type=Path, default=None, help="folder of the results of one agent")
     add_scores_flag(parser)
     parser.set_defaults(run=_run)
@@ -107,13 +105,15 @@ def _run(options: argparse.Namespace, output: Output) -> int:
 def _made(agent: str, task: Task, options: argparse.Namespace) -> Agent:
     if agent == _PLANNER and options.seconds is not None:
         return Planner(seconds=options.seconds)
-    return make_agent(agent, task, top_k=options.top_k)
+    return make_agent(agent, task, **keywords.looking(options))
 
 
 def _own_flags(agent: str, options: argparse.Namespace) -> dict[str, str]:
     """Flags that say how this agent decides, and their values."""
-    flags = {"seconds": options.seconds if agent == _PLANNER else None, "top-k": options.top_k}
-    return {name: f"{value:g}" for name, value in flags.items() if value is not None}
+    flags: dict[str, float] = {flag_of(name): value for name, value in keywords.looking(options).items()}
+    if agent == _PLANNER and options.seconds is not None:
+        flags["seconds"] = options.seconds
+    return {name: f"{value:g}" for name, value in flags.items()}
 
 
 def _name_of_last(agent: str, made: Agent) -> str | None:

@@ -7,7 +7,7 @@ from typing import Any
 
 from rl2grid.envs.options import option_texts, options_without
 from rl2grid.errors import UsageError
-from rl2grid.evaluation.flags import flag_of
+from rl2grid.evaluation.flags import LOOKING, flag_of
 from rl2grid.mdp.rewards import resolve_reward
 
 GIVEN_OTHERWISE = ("split", "scenario", "gamma")
@@ -40,6 +40,20 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
             help=flag_text(option.name).replace("%", "%%"),
             **how,
         )
+
+
+def add_looking(parser: argparse.ArgumentParser, others: str = "") -> None:
+    """Add the flags that say how a policy looks before it acts; ``others`` follows their help."""
+    for name, metavar, text in (
+        ("top-k", "K", "of policies: the what-if chooses of their K best actions; by default they play the best"),
+        ("rehearse", "STEPS", "of policies: so much of a crisis, 24 for instance, is played in imagined worlds first"),
+    ):
+        parser.add_argument(f"--{name}", type=int, default=None, metavar=metavar, help=text + others)
+
+
+def looking(options: argparse.Namespace) -> dict[str, int]:
+    """How policies are to look before they act: what was given of :data:`rl2grid.evaluation.flags.LOOKING`."""
+    return {name: value for name in LOOKING if (value := getattr(options, name)) is not None}
 
 
 def flag_text(name: str) -> str:

@@ -9,6 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rl2grid.cli import keywords
 from rl2grid.cli.output import Output
 from rl2grid.cli.scoring import add_scores_flag, scored_table
 from rl2grid.envs.tasks import find_task
@@ -66,9 +67,7 @@ def _add_verify(actions: Any) -> None:
 
 def _add_choices(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--months", type=int, default=None, help="the first of the test months; by default all")
-    parser.add_argument(
-        "--top-k", type=int, default=None, metavar="K", help="of policies: the what-if chooses of their K best actions"
-    )
+    keywords.add_looking(parser)
 
 
 def _add_table(actions: Any) -> None:
@@ -116,7 +115,7 @@ def _entry(options: argparse.Namespace, output: Output) -> int:
 def _test(options: argparse.Namespace, output: Output) -> int:
     from rl2grid.ledger.subjects import count_look, find_subject, play_test
 
-    for subject in [find_subject(text, options.months, options.top_k) for text in options.subjects]:
+    for subject in [find_subject(text, options.months, **keywords.looking(options)) for text in options.subjects]:
         results = read_ledger(options.ledger)
         if subject.digest in results:
             output.remark(f"{subject.agent} on {subject.task.id} has had its test: see {options.ledger.name}.")
@@ -138,7 +137,7 @@ def _verify_tests(options: argparse.Namespace, output: Output) -> int:
     from rl2grid.ledger.verification import verify_test
 
     found: dict[str, str | None] = {}
-    for subject in [find_subject(text, options.months, options.top_k) for text in options.files]:
+    for subject in [find_subject(text, options.months, **keywords.looking(options)) for text in options.files]:
         stored = read_ledger(options.ledger).get(subject.digest)
         if stored is None:
             raise UsageError(f"The ledger has no test of {str(subject.agent)!r} on {subject.task.id} to compare with.")

@@ -9,7 +9,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from rl2grid.cli.keywords import AGENT_HELP
+from rl2grid.cli import keywords
 from rl2grid.cli.main import INTERRUPTED
 from rl2grid.cli.output import Output
 from rl2grid.engines import HEURISTICS
@@ -30,7 +30,7 @@ FORMATS = ("html", "gif", "mp4")
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add the flags of the command."""
-    parser.add_argument("agent", help=AGENT_HELP)
+    parser.add_argument("agent", help=keywords.AGENT_HELP)
     parser.add_argument("task", help="for example bus14-T0")
     parser.add_argument(
         "--against", nargs="+", default=[], metavar="AGENT", help="others who play the same month, on the same page"
@@ -40,12 +40,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0, help="of maintenance, opponent and agent")
     parser.add_argument("--heuristic", default=None, choices=("None", *HEURISTICS), help="by default the agent's own")
     parser.add_argument("--steps", type=int, default=None, help="play no more grid steps than these")
-    parser.add_argument(
-        "--top-k",
-        type=int,
-        default=None,
-        help="best actions of the policy of which the what-if chooses; by default 1; those of --against play alone",
-    )
+    keywords.add_looking(parser, "; those of --against do not look")
     parser.add_argument(
         "--every", type=int, default=None, help=f"grid steps between two frames; by default at most {FRAMES} frames"
     )
@@ -65,7 +60,7 @@ def _run(options: argparse.Namespace, output: Output) -> int:
     check_folder(options.output)
     try:
         with _progress(output) as progress:
-            recordings = [_play(agent, task, options, top_k, progress) for agent, top_k in _players(options)]
+            recordings = [_play(agent, task, options, looking, progress) for agent, looking in _players(options)]
             make_folder(options.output)
             files = _files(task, recordings, options)
             there = {file for file in files if file.exists()}
@@ -95,13 +90,13 @@ def _check_agents(task: Task, options: argparse.Namespace) -> None:
     from rl2grid.evaluation.protocol import check_playable
 
     asked = {"split": options.split, "heuristic": _heuristic(options)}
-    for agent, top_k in _players(options):
-        check_playable(make_agent(agent, task, top_k=top_k), task, asked)
+    for agent, looking in _players(options):
+        check_playable(make_agent(agent, task, **looking), task, asked)
 
 
-def _players(options: argparse.Namespace) -> list[tuple[str, int | None]]:
-    """Who plays, and of how many of its best actions the what-if chooses."""
-    return [(options.agent, options.top_k), *((agent, None) for agent in options.against)]
+def _players(options: argparse.Namespace) -> list[tuple[str, dict[str, int]]]:
+    """Who plays, and how it looks before it acts."""
+    return [(options.agent, keywords.looking(options)), *((agent, {}) for agent in options.against)]
 
 
 def _files(task: Task, recordings: Sequence[Recording], options: argparse.Namespace) -> dict[Path, list[Recording]]:
@@ -138,7 +133,9 @@ def _result(recording: Recording) -> dict[str, Any]:
     }
 
 
-def _play(agent: str, task: Task, options: argparse.Namespace, top_k: int | None, progress: Progress) -> Recording:
+def _play(
+    agent: str, task: Task, options: argparse.Namespace, looking: dict[str, int], progress: Progress
+) -> Recording:
     from rl2grid.evaluation.watching import play_to_watch
 
     playing = progress.add_task("Playing", total=None)
@@ -150,7 +147,7 @@ def _play(agent: str, task: Task, options: argparse.Namespace, top_k: int | None
         seed=options.seed,
         heuristic=_heuristic(options),
         steps=options.steps,
-        top_k=top_k,
+        **looking,
         on_step=lambda step, length: progress.update(
             playing, completed=step, total=min(length, options.steps or length)
         ),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rl2grid.agents.agent import Agent, SpecialisedAgent
 from rl2grid.agents.dc_opf import DcOpf
@@ -21,6 +22,9 @@ from rl2grid.envs.tasks import Task
 from rl2grid.errors import UsageError, one_of
 from rl2grid.evaluation.own_agents import is_own, load_own_agent
 from rl2grid.mdp.features import KINDS
+
+if TYPE_CHECKING:
+    from rl2grid.algorithms.policy_agent import PolicyAgent
 
 AGENTS: dict[str, Callable[[], Agent]] = {
     DoNothing.name: DoNothing,
@@ -43,7 +47,9 @@ def kinds_of(name: str) -> tuple[str, ...]:
     return agent.kinds if isinstance(agent, SpecialisedAgent) else KINDS
 
 
-def make_agent(spec: str | Path, task: Task | None = None, *, top_k: int | None = None) -> Agent:
+def make_agent(
+    spec: str | Path, task: Task | None = None, *, top_k: int | None = None, rehearse: int | None = None
+) -> Agent:
     """The agent that ``spec`` asks for.
 
     Args:
@@ -52,12 +58,15 @@ def make_agent(spec: str | Path, task: Task | None = None, *, top_k: int | None 
         task: the task that the agent is to play; checkpoints of other tasks are refused.
         top_k: of a policy: how many of its best actions the what-if compares (:class:`rl2grid.algorithms.top_k.TopK`);
             None: it plays its best.
+        rehearse: of a policy: how many grid steps of a crisis are played in imagined worlds first
+            (:class:`rl2grid.algorithms.rehearsed.Rehearsed`); None: none are.
 
     Raises:
-        UsageError: there is no such agent, it cannot play the task, or it is no policy and ``top_k`` was given.
+        UsageError: there is no such agent, it cannot play the task, or it is no policy and ``top_k`` or ``rehearse``
+            was given.
     """
-    if top_k is not None and (str(spec) in AGENTS or is_own(str(spec))):
-        raise UsageError(f"top_k compares the best actions of a trained policy: leave it out for {spec}.")
+    if str(spec) in AGENTS or is_own(str(spec)):
+        _refuse_looking(spec, top_k, rehearse)
     if isinstance(spec, str) and spec in AGENTS:
         return AGENTS[spec]()
     if is_own(str(spec)):
@@ -76,8 +85,20 @@ def make_agent(spec: str | Path, task: Task | None = None, *, top_k: int | None 
     from rl2grid.algorithms.policy_agent import load_agent
 
     policy = load_agent(path, task)
-    if top_k is None:
-        return policy
+    return policy if top_k is None and rehearse is None else _looking(policy, top_k, rehearse)
+
+
+def _looking(policy: PolicyAgent, top_k: int | None, rehearse: int | None) -> Agent:
+    """A policy that looks before it acts."""
+    from rl2grid.algorithms.rehearsed import Rehearsed
     from rl2grid.algorithms.top_k import TopK
 
-    return TopK(policy, top_k)
+    player = policy if top_k is None else TopK(policy, top_k)
+    return player if rehearse is None else Rehearsed(player, rehearse)
+
+
+def _refuse_looking(spec: str | Path, top_k: int | None, rehearse: int | None) -> None:
+    if top_k is not None:
+        raise UsageError(f"top_k compares the best actions of a trained policy: leave it out for {spec}.")
+    if rehearse is not None:
+        raise UsageError(f"rehearse plays the crises of a trained policy in advance: leave it out for {spec}.")

@@ -13,6 +13,8 @@ from rl2grid.envs.tasks import Task, short_id
 _FLAGS = {"total_timesteps": "decisions", "start_from": "from"}
 """Hyperparameters that have the name of CleanRL, and the word that every command has for the same thing; or a name
 beside a word that Python keeps for itself."""
+LOOKING = ("top_k", "rehearse")
+"""Keywords of :func:`rl2grid.evaluation.agents.make_agent` that say how a policy looks before it acts."""
 
 
 def flag_of(name: str) -> str:

@@ -24,6 +24,7 @@ def play_to_watch(
     heuristic: str | None = AS_TRAINED,
     steps: int | None = None,
     top_k: int | None = None,
+    rehearse: int | None = None,
     on_step: OnStep | None = None,
 ) -> Recording:
     """Play and record one episode; it is the one that an evaluation with the same seed plays.
@@ -37,6 +38,7 @@ def play_to_watch(
         heuristic: None, one of :data:`rl2grid.engines.HEURISTICS`, or the one that the policy was trained with.
         steps: record no more grid steps than these.
         top_k: of a policy: how many of its best actions the what-if compares; None: it plays its best.
+        rehearse: of a policy: how many grid steps of a crisis are played in imagined worlds first; None: none are.
         on_step: called after every grid step.
 
     Raises:
@@ -47,7 +49,7 @@ def play_to_watch(
         raise UsageError(f"steps={steps} is not allowed: give a number of grid steps, at least 1.")
     if seed < 0:
         raise UsageError(f"seed={seed} is not allowed: give an integer that is not negative.")
-    chosen = make_agent(agent, task, top_k=top_k)
+    chosen = make_agent(agent, task, top_k=top_k, rehearse=rehearse)
     keywords = env_keywords(chosen, {"split": split, "heuristic": heuristic})
     if scenario is None:
         scenario = list_scenarios(task.grid_id, split)[0]

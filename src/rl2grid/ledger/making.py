@@ -12,6 +12,7 @@ from rl2grid.agents.agent import Action, Agent
 from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import AGENTS, make_agent
+from rl2grid.evaluation.flags import LOOKING
 from rl2grid.evaluation.own_agents import is_own
 from rl2grid.ledger.replay import (
     OnProgress,
@@ -116,7 +117,7 @@ def _find_agent(result: Evaluation, task: Task, run: Path | None, agent: str | N
         raise UsageError(f"Agent {identity['agent']!r} of {result.folder} was not found: name it with --agent.")
     stored = identity["agent_identity"]
     for candidate in candidates:
-        made = make_agent(candidate, task, top_k=_top_k(stored, candidate))
+        made = make_agent(candidate, task, **_looking(stored, candidate))
         if json.loads(json.dumps(getattr(made, "identity", None))) == stored:
             return made
     looked = " or ".join(map(str, candidates)) or f"in {run}"
@@ -126,11 +127,11 @@ def _find_agent(result: Evaluation, task: Task, run: Path | None, agent: str | N
     )
 
 
-def _top_k(stored: Any, candidate: str | Path) -> int | None:
-    """Of how many of a policy's best actions the what-if chose; None: it played its best, or is no policy."""
+def _looking(stored: Any, candidate: str | Path) -> dict[str, int]:
+    """How a policy looked before it acted; empty where it did not, or the candidate is no policy."""
     if not isinstance(stored, dict) or candidate in AGENTS or is_own(str(candidate)):
-        return None
-    return stored.get("top_k")
+        return {}
+    return {name: stored[name] for name in LOOKING if name in stored}
 
 
 def _training_facts(run: Path) -> dict[str, Any]:

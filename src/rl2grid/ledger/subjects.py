@@ -14,10 +14,11 @@ from rl2grid.engines import INJECTION_RULES
 from rl2grid.envs.tasks import Task, find_task, short_id
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import make_agent
+from rl2grid.evaluation.flags import LOOKING
 from rl2grid.evaluation.protocol import AS_TRAINED, check_playable, evaluate, first_months
 from rl2grid.records.collection import was_evaluated
 from rl2grid.records.evaluations import Evaluation, identity_hash
-from rl2grid.records.ledger import STARTED_FROM, HashedTest, agent_of, choice_hash, hashed_test
+from rl2grid.records.ledger import STARTED_FROM, HashedTest, agent_of, choice_hash, hashed_test, looking_of
 from rl2grid.records.looks import LOOKS, earlier_choices, looks
 from rl2grid.records.metrics import read_validations, trained_seconds
 from rl2grid.records.trainings import read_training_run
@@ -43,9 +44,9 @@ class Subject:
     """The checkpoint of the last policy; None where that is the best one, or nothing was trained."""
 
     @property
-    def top_k(self) -> int | None:
-        """Of how many of the policy's best actions the what-if chooses; None: it plays its best."""
-        return self.configuration.get("top_k")
+    def looking(self) -> dict[str, int]:
+        """How a policy looks before it acts, as :func:`rl2grid.evaluation.agents.make_agent` takes it."""
+        return {name: self.configuration[name] for name in LOOKING if name in self.configuration}
 
     @property
     def digest(self) -> str:
@@ -64,22 +65,21 @@ class Subject:
 
     def __str__(self) -> str:
         """What messages call it."""
-        best = "" if self.top_k is None else f", best of {self.top_k}"
-        return f"{self.agent}{best} on {short_id(self.task.id)}, heuristic {self.heuristic}"
+        return f"{self.agent}{looking_of(self.configuration)} on {short_id(self.task.id)}, heuristic {self.heuristic}"
 
 
-def find_subject(text: str, months: int | None = None, top_k: int | None = None) -> Subject:
+def find_subject(text: str, months: int | None = None, **looking: int) -> Subject:
     """What the command line names.
 
     Args:
         text: a run folder, a policy of the package as ``pretrained/bus14-T0``, or an agent as ``greedy@bus14-T0`` or
             ``random@bus14-T0:idle``.
         months: how many of the test months it plays, the first of the list; None: all.
-        top_k: of how many of a policy's best actions the what-if chooses; None: it plays its best.
+        **looking: how a policy looks before it acts, of :data:`rl2grid.evaluation.flags.LOOKING`.
 
     Raises:
         UsageError: a run that is not finished or was never validated, no such agent, task, heuristic or run, an agent
-            that cannot play the task or knows the future, or ``top_k`` for what is no policy.
+            that cannot play the task or knows the future, or what is no policy and is to look.
     """
     if "@" in text:
         agent, _, rest = text.partition("@")
@@ -89,10 +89,10 @@ def find_subject(text: str, months: int | None = None, top_k: int | None = None)
         subject = _of_the_package(text, months)
     else:
         subject = _trained(Path(text), months)
-    if top_k is None:
+    if not looking:
         return subject
-    make_agent(subject.agent, subject.task, top_k=top_k)  # refuses agents that have no best actions
-    return replace(subject, configuration={**subject.configuration, "top_k": top_k})
+    make_agent(subject.agent, subject.task, **looking)  # refuses agents that are no policies
+    return replace(subject, configuration={**subject.configuration, **looking})
 
 
 def count_look(subject: Subject, results: Mapping[str, HashedTest]) -> str:
@@ -136,7 +136,7 @@ def play_test(subject: Subject, progress: bool = True) -> HashedTest:
 
 def _play(subject: Subject, agent: str | Path, progress: bool) -> Evaluation:
     result = evaluate(
-        agent if subject.top_k is None else make_agent(agent, subject.task, top_k=subject.top_k),
+        make_agent(agent, subject.task, **subject.looking) if subject.looking else agent,
         subject.task,
         split=TEST,
         scenarios=first_months(subject.task, TEST, subject.configuration["test"]["months"]),

@@ -91,13 +91,12 @@ class HashedTest:
 
     @property
     def player(self) -> str:
-        """The agent, its network if no ``mlp``, features beside the paper's, of how many actions the what-if chose."""
+        """The agent, its network if no ``mlp``, features beside the paper's, and how it looks before it acts."""
         network = self.configuration.get("hyperparameters", {}).get("network", "mlp")
         features = self.configuration.get("env_keywords", {}).get("operator_features")
-        top_k = self.configuration.get("top_k")
         observing = "" if features is None else f", observing {features}"
         with_network = "" if network == "mlp" else f", {network}"
-        return f"{self.agent}{with_network}{observing}" + ("" if top_k is None else f", best of {top_k}")
+        return f"{self.agent}{with_network}{observing}{looking_of(self.configuration)}"
 
     @property
     def label(self) -> str:
@@ -120,6 +119,13 @@ def agent_of(configuration: Mapping[str, Any]) -> str:
     began = configuration.get(STARTED_FROM)
     name = str(configuration.get("algorithm") or configuration["agent"])
     return name if began is None else f"{name} from {began['algorithm']}"
+
+
+def looking_of(configuration: Mapping[str, Any]) -> str:
+    """How a policy looks before it acts, as it follows its name; empty where it does not."""
+    top_k, rehearse = configuration.get("top_k"), configuration.get("rehearse")
+    best = "" if top_k is None else f", best of {top_k}"
+    return best if rehearse is None else f"{best}, rehearsing {rehearse} steps"
 
 
 def choice_hash(configuration: Mapping[str, Any]) -> str:
