@@ -1,9 +1,10 @@
 """Makes a policy that comes with the package of a training run: its weights and its model card.
 
 ``python benchmarks/pretrained.py RUN NAME --made-by COMMAND ... --limits TEXT [--beside AGENT ...] [--months N]
-[--skip N] [--top-k K]`` plays the policy, the policy with the what-if among its K best actions, and the agents beside
-it on N validation months after the first ``--skip``, by which the training picked its best policy, and writes
-``src/rl2grid/algorithms/policies/NAME.pt`` and ``NAME.json``. ``rl2grid pretrained`` shows them.
+[--skip N] [--top-k K] [--rehearse STEPS]`` plays the policy, the policy that looks before it acts in each of the ways
+that are asked for, and the agents beside it on N validation months after the first ``--skip``, by which the training
+picked its best policy, and writes ``src/rl2grid/algorithms/policies/NAME.pt`` and ``NAME.json``. ``rl2grid pretrained``
+shows them.
 """
 
 from __future__ import annotations
@@ -19,7 +20,9 @@ from rl2grid.agents.agent import Agent
 from rl2grid.algorithms.checkpoint import load_checkpoint, save_checkpoint
 from rl2grid.algorithms.policy_agent import BEST_FILE, load_agent
 from rl2grid.algorithms.pretrained import LARGEST, ModelCard, Survival, folder
+from rl2grid.algorithms.rehearsed import Rehearsed
 from rl2grid.algorithms.top_k import TopK
+from rl2grid.cli.keywords import add_looking
 from rl2grid.envs.tasks import Task, short_id
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import make_agent
@@ -48,7 +51,7 @@ def main() -> None:
     parser.add_argument("--beside", nargs="*", default=["do-nothing"])
     parser.add_argument("--months", type=int, default=50)
     parser.add_argument("--skip", type=int, default=20)
-    parser.add_argument("--top-k", type=int, default=None)
+    add_looking(parser)
     options = parser.parse_args()
 
     args, _ = read_config(options.run)
@@ -59,6 +62,8 @@ def main() -> None:
     agents: list[Agent] = [policy]
     if options.top_k is not None:
         agents.append(TopK(load_agent(options.run, name=policy.name), options.top_k))
+    if options.rehearse is not None:
+        agents.append(Rehearsed(load_agent(options.run, name=policy.name), options.rehearse))
     agents += [make_agent(name, task) for name in options.beside]
     card = ModelCard(
         name=options.name,

@@ -30,8 +30,8 @@ def row(card: ModelCard) -> str:
     own, *others = card.validation
     looking = [each for each in others if each.agent.startswith(own.agent)]
     beside = ", ".join(f"{each.agent} {each.survival:.3f}" for each in others if each not in looking)
-    best = looking[0].agent.removeprefix(f"{own.agent}, ") + f": {words(looking[0])}" if looking else ""
-    return f"| `{card.name}` | {card.algorithm} | {words(own)} | {best} | {beside} | {own.months} |"
+    looked = ", ".join(f"{each.agent.removeprefix(f'{own.agent}, ')}: {words(each)}" for each in looking)
+    return f"| `{card.name}` | {card.algorithm} | {words(own)} | {looked} | {beside} | {own.months} |"
 
 
 @EVERY
