@@ -15,9 +15,8 @@ from rl2grid.errors import UsageError
 class Rehearsed(Rehearsal):
     """Plays what a policy plays; in a crisis, only after it went well in an imagined world.
 
-    What :class:`~rl2grid.agents.rehearsal.Rehearsal` does with the planner as its guide, with a policy in its place:
-    one that has learned to keep the grid prepared is helped out where it fails, and plays on in rehearsals in a
-    fraction of the planner's time.
+    What :class:`~rl2grid.agents.rehearsal.Rehearsal` does with the planner as its guide, with a policy in its place,
+    which plays on in rehearsals in a fraction of the planner's time.
 
     Args:
         policy: the guide, not bound yet.
