@@ -20,12 +20,10 @@ from rl2grid.agents.agent import Agent
 from rl2grid.algorithms.checkpoint import load_checkpoint, save_checkpoint
 from rl2grid.algorithms.policy_agent import BEST_FILE, load_agent
 from rl2grid.algorithms.pretrained import LARGEST, ModelCard, Survival, folder
-from rl2grid.algorithms.rehearsed import Rehearsed
-from rl2grid.algorithms.top_k import TopK
-from rl2grid.cli.keywords import add_looking
+from rl2grid.cli.keywords import add_looking, looking
 from rl2grid.envs.tasks import Task, short_id
 from rl2grid.errors import UsageError
-from rl2grid.evaluation.agents import make_agent
+from rl2grid.evaluation.agents import looking_policy, make_agent
 from rl2grid.evaluation.protocol import evaluate
 from rl2grid.records.files import write_json
 from rl2grid.training.request import read_config
@@ -60,10 +58,8 @@ def main() -> None:
     months = validation_months(task, options.skip, options.months)
     policy = load_agent(options.run, name=f"pretrained-{options.name}")
     agents: list[Agent] = [policy]
-    if options.top_k is not None:
-        agents.append(TopK(load_agent(options.run, name=policy.name), options.top_k))
-    if options.rehearse is not None:
-        agents.append(Rehearsed(load_agent(options.run, name=policy.name), options.rehearse))
+    for way, value in looking(options).items():
+        agents.append(looking_policy(load_agent(options.run, name=policy.name), **{way: value}))
     agents += [make_agent(name, task) for name in options.beside]
     card = ModelCard(
         name=options.name,

@@ -84,12 +84,15 @@ def make_agent(
     # Imported here: agents without training run without torch.
     from rl2grid.algorithms.policy_agent import load_agent
 
-    policy = load_agent(path, task)
-    return policy if top_k is None and rehearse is None else _looking(policy, top_k, rehearse)
+    return looking_policy(load_agent(path, task), top_k=top_k, rehearse=rehearse)
 
 
-def _looking(policy: PolicyAgent, top_k: int | None, rehearse: int | None) -> Agent:
-    """A policy that looks before it acts."""
+def looking_policy(policy: PolicyAgent, *, top_k: int | None = None, rehearse: int | None = None) -> Agent:
+    """A policy that looks before it acts, as :func:`make_agent` says; itself if it is not to look.
+
+    Raises:
+        UsageError: one of the two is below 1, or the policy has no actions of the kind that is looked at.
+    """
     from rl2grid.algorithms.rehearsed import Rehearsed
     from rl2grid.algorithms.top_k import TopK
 
