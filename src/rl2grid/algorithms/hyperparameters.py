@@ -12,6 +12,7 @@ from rl2grid.errors import UsageError, one_of
 DEVICES = ("auto", "cpu", "cuda")
 
 _ADDED_LATER = "added_later"
+_PATHS = {"labels", "start_from"}
 
 
 def added_later(default: Any) -> Any:
@@ -23,9 +24,12 @@ def added_later(default: Any) -> Any:
 
 
 def identifying(args: Any) -> dict[str, Any]:
-    """The hyperparameters by which a training is told from others: all but later ones that have their default."""
+    """The hyperparameters by which a training is told from others: all but later ones that have their default.
+
+    Paths are left out, too: what lies there is what counts, and is told apart.
+    """
     later = [each for each in fields(args) if each.metadata.get(_ADDED_LATER)]
-    left_out = {each.name for each in later if getattr(args, each.name) == each.default}
+    left_out = {each.name for each in later if getattr(args, each.name) == each.default} | _PATHS
     return {name: value for name, value in asdict(args).items() if name not in left_out}
 
 

@@ -26,8 +26,6 @@ from rl2grid.scenarios.library import split_version
 from rl2grid.scenarios.splits import TEST
 
 _OF_LABELS = ("teacher", "rounds", "months", "labels")
-_PLACES = ("labels", "start_from")
-"""Hyperparameters that are paths: what lies there is what counts."""
 
 
 @dataclass(frozen=True)
@@ -220,9 +218,7 @@ def _trained(folder: Path, months: int | None) -> Subject:
     configuration = {
         "algorithm": args.algorithm,
         "task": args.task.id,
-        "hyperparameters": {
-            name: value for name, value in identifying(args.hyperparameters).items() if name not in _PLACES
-        },
+        "hyperparameters": identifying(args.hyperparameters),
         "env_keywords": _frozen(args.env_keywords),
         "targets_version": identity.get("targets_version", 1),
         "test": tested_months(args.task, months),
