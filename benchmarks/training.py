@@ -10,6 +10,7 @@ and Grid2Op doing nothing. Cases:
 - ``random``: random actions of the task's smallest set, no heuristic, 256 environments, one thread, per second of
   processor time. The library is made before, in both revisions; a first round, which compiles, does not count.
 - ``nothing``: doing nothing, 64 environments, one thread.
+- ``careful``: random actions, 64 environments, one thread, and the heuristic ``careful`` between decisions.
 - ``first_step``: from the start of a process to the end of the first step of 256 environments, on an empty data folder,
   with compiled code there.
 - ``threads``: 256 environments, one thread and two in turns, wall clock.
@@ -46,7 +47,8 @@ import json, sys, time
 import gymnasium, numpy as np
 import rl2grid
 task, n, play, seconds = sys.argv[1], int(sys.argv[2]), sys.argv[3], float(sys.argv[4])
-envs = gymnasium.make_vec(f"rl2grid/{task}-v0", num_envs=n, num_threads=1, heuristic=None)
+heuristic = sys.argv[5] if len(sys.argv) > 5 else None
+envs = gymnasium.make_vec(f"rl2grid/{task}-v0", num_envs=n, num_threads=1, heuristic=heuristic)
 numbers, generator = envs.single_action_space.n, np.random.default_rng(0)
 def actions():
     return generator.integers(numbers, size=n) if play == "random" else np.zeros(n, np.int64)
@@ -114,6 +116,7 @@ def cases() -> dict[str, tuple[str, ...]]:
     for task in TASKS:
         found[f"random {task}"] = (_PLAY, task, "256", "random", str(SECONDS))
         found[f"nothing {task}"] = (_PLAY, task, "64", "nothing", str(SECONDS))
+        found[f"careful {task}"] = (_PLAY, task, "64", "random", str(SECONDS), "careful")
     return found
 
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from rl2grid.arrays import F32
 from rl2grid.compile import jit
 from rl2grid.mdp.actions import ActionKind
 from rl2grid.mdp.state import GridState
@@ -32,13 +33,16 @@ _NOTHING, _RECONNECT, _RESTORE = int(ActionKind.NOTHING), int(ActionKind.RECONNE
 @jit
 def is_safe(state: GridState, i: int) -> bool:
     """Whether every line of row ``i`` is loaded less than 95%: the heuristic plays, not the agent."""
-    return bool(np.all(state.rho[i] < SAFE_RHO))
+    return _all_below(state.rho[i], SAFE_RHO)
 
 
 @jit
 def is_at_rest(state: GridState, i: int) -> bool:
     """Whether every generator of row ``i`` produces what its series says: no agent has to bring it back."""
-    return bool(np.all(np.abs(state.actual_dispatch[i]) < LEAST_DISPATCH))
+    at_rest = True
+    for gen in range(state.actual_dispatch.shape[1]):
+        at_rest &= np.abs(state.actual_dispatch[i, gen]) < LEAST_DISPATCH
+    return bool(at_rest)
 
 
 @jit
@@ -102,7 +106,7 @@ def candidate_action(state: GridState, candidate: int) -> tuple[int, int]:
 @jit
 def is_careful_enough(forecast: GridState, j: int) -> bool:
     """Whether row ``j``, a forecast of what follows an action, is one that the careful heuristic allows."""
-    return bool(not forecast.terminated[j] and np.all(forecast.rho[j] < CAREFUL_RHO))
+    return bool(not forecast.terminated[j]) and _all_below(forecast.rho[j], CAREFUL_RHO)
 
 
 @jit
@@ -138,11 +142,26 @@ def remember_move(state: GridState, i: int, sub: int) -> None:
 @jit
 def _is_split(state: GridState, i: int, sub: int) -> bool:
     first = state.sub_first_element[sub]
-    return bool(np.any(state.topo_vect[i, first : first + state.sub_info[sub]] == 2))
+    split = False
+    for element in range(first, first + state.sub_info[sub]):
+        split |= state.topo_vect[i, element] == 2
+    return bool(split)
 
 
 @jit
 def _relieves(state: GridState, i: int, sub: int) -> bool:
     """Whether a line is out that was out when the substation was last split."""
     opened = state.open_since[i]
-    return bool(np.any((opened >= 0) & (opened < state.split_since[i, sub])))
+    relieves = False
+    for line in range(opened.shape[0]):
+        relieves |= 0 <= opened[line] < state.split_since[i, sub]
+    return bool(relieves)
+
+
+@jit
+def _all_below(values: F32, limit: np.float32) -> bool:
+    """Whether all are less; a value that is no number is not. No array is made: it is asked after every step."""
+    below = True
+    for k in range(values.shape[0]):
+        below &= values[k] < limit
+    return bool(below)
