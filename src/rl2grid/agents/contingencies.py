@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +21,8 @@ _MAINTENANCE_WEIGHT = 3.0
 
 _CERTAIN_WEIGHT = 20.0
 """The same of one that somebody knows of."""
+_DISARMED_BY_AN_OPEN_LINE = ("geometric", "multi_area")
+"""Kinds of opponent."""
 
 
 class Contingencies(NamedTuple):
@@ -32,8 +35,8 @@ class Contingencies(NamedTuple):
 NONE = Contingencies(np.zeros(0, np.int32), np.zeros(0))
 
 
-def expected(grid: Grid, state: GridState) -> Contingencies:
-    """What may be lost from row 0, by what is published and announced.
+def expected(grid: Grid, state: GridState, areas: Sequence[tuple[int, ...]] | None = None) -> Contingencies:
+    """What may be lost from row 0, by what is published and announced; attacks in some areas, None: in all.
 
     Attackable lines count as often as the opponent would choose them now: all alike, or, of a weighted opponent, by
     their loading beside the usual one; the mean weight is 1. Nobody attacks a second line while one is attacked, but
@@ -41,15 +44,25 @@ def expected(grid: Grid, state: GridState) -> Contingencies:
     """
     soon = state.time_next_maintenance[0]
     planned = np.flatnonzero((soon > 0) & (soon <= _SOON) & state.line_status[0])
-    areas = grid.opponent.areas
-    busy = len(areas) == 1 and bool(state.attacked[0].any())
-    attackable = np.array(sorted({line for area in areas for line in area}), np.int64)
+    busy = len(grid.opponent.areas) == 1 and bool(state.attacked[0].any())
+    attacked = grid.opponent.areas if areas is None else areas
+    attackable = np.array(sorted({line for area in attacked for line in area}), np.int64)
     attackable = (
         attackable[state.line_status[0][attackable] & ~np.isin(attackable, planned)] if not busy else planned[:0]
     )
     lines = np.concatenate((planned, attackable)).astype(np.int32)
     weight = np.concatenate((np.full(len(planned), _MAINTENANCE_WEIGHT), _attack_weights(grid, state, attackable)))
     return Contingencies(lines, weight)
+
+
+def areas_to_attack(grid: Grid, state: GridState) -> list[tuple[int, ...]]:
+    """The opponent's areas in which it may attack: some opponents do not where one of the area's lines is open
+    (``docs/mdp.md``, *Opponents that an open line disarms*).
+    """
+    closed, areas = state.line_status[0], grid.opponent.areas
+    if grid.opponent.kind not in _DISARMED_BY_AN_OPEN_LINE:
+        return list(areas)
+    return [area for area in areas if closed[list(area)].all()]
 
 
 def with_certain(contingencies: Contingencies, lines: I32) -> Contingencies:

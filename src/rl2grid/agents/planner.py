@@ -101,8 +101,10 @@ class Planner:
         UsageError: there is no such ingredient, or the seconds are no positive number.
     """
 
-    kinds = ("T", "R", "H")
+    kinds: ClassVar[tuple[str, ...]] = ("T", "R", "H")
     rules: ClassVar[Mapping[str, int]] = {"T": 2, "R": 3, "H": 3}
+    called: ClassVar[str] = "planner"
+    """Its name, without what is left out of it."""
 
     def __init__(self, without: Collection[str] = (), seconds: float | None = None) -> None:
         if isinstance(without, str) or not isinstance(without, Collection):
@@ -114,7 +116,7 @@ class Planner:
             raise UsageError(f"seconds={seconds!r} is not allowed: give a positive number.")
         self._foretold: Foretold | None = None
         self._without, self._seconds = frozenset(without), seconds
-        self.name = "planner" + "".join(f" without {each}" for each in sorted(self._without))
+        self.name = self.called + "".join(f" without {each}" for each in sorted(self._without))
         if seconds is not None:
             self.name += f" ({seconds:g} s)"
 
@@ -239,7 +241,7 @@ class Planner:
             return NOTHING
         effect = effects(self._grid, moment.state, self._catalogue)
         closes = effect.restores & (self._catalogue.kind == ActionKind.SWITCH)
-        line = self._best_of(moment, np.flatnonzero(closes), SAFE)
+        line = self._best_of(moment, self._worth_closing(moment.state, np.flatnonzero(closes)), SAFE)
         if line:
             self._why = "while the grid is safe, a line is closed if that keeps it so"
             return line[0]
@@ -249,7 +251,7 @@ class Planner:
         candidates = self._best_of(moment, homeward, _RESTORE_BELOW)
         if not candidates:
             return NOTHING
-        contingencies = expected(self._grid, moment.state)
+        contingencies = self._expected(moment.state)
         before = danger(self._what_if, moment.ahead, contingencies)
         for entry in candidates:
             after = self._search.after(moment.ahead, entry)
@@ -329,7 +331,15 @@ class Planner:
         """The outages by which sequences are chosen: none while one attack is on."""
         if "danger" in self._without or moment.state.attacked[0].any():
             return NONE
-        return expected(self._grid, moment.state)
+        return self._expected(moment.state)
+
+    def _expected(self, state: GridState) -> Contingencies:
+        """The outages that may come."""
+        return expected(self._grid, state)
+
+    def _worth_closing(self, state: GridState, entries: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Of the entries that close a line, those that may be played while the grid is safe."""
+        return entries
 
     def _can_close(self, moment: _Moment) -> bool:
         state = moment.state
@@ -365,7 +375,7 @@ class Planner:
         if topology != NOTHING:
             assert self._search is not None
             point = self._search.after(point, topology)
-        contingencies = NONE if "prevention" in self._without else expected(self._grid, moment.state)
+        contingencies = NONE if "prevention" in self._without else self._expected(moment.state)
         foretold, everything = self._foretold_at(moment.state), not moment.safe
         if foretold is not None:
             contingencies, everything = with_certain(contingencies, foretold.lines), True

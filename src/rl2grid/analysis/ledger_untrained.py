@@ -20,8 +20,8 @@ from rl2grid.records.ledger import HashedTest
 
 ALONE: Mapping[str, str | None] = {"do nothing": None, "`recovery`": "recovery", "`careful`": "careful"}
 """Heuristics under which nobody acts: a grid has one value of each, as none of what its tasks offer is chosen."""
-ACTING = {"greedy search": "greedy", "planner": PLANNER, "rehearsal": "rehearsal"}
-"""Agents, of which each cell has the heuristic by which they survive longest."""
+ACTING = {"greedy search": ("greedy",), "planner": (PLANNER, "planner-open"), "rehearsal": ("rehearsal",)}
+"""Agents, of which each cell has the one, and the heuristic, that survives longest; it names all but the first."""
 
 Milliseconds = Mapping[tuple[str, str, str | None], tuple[float, float]]
 """Within which half of the decisions are made and 99 of 100, by task (in short), agent and heuristic."""
@@ -40,7 +40,7 @@ def untrained_table(results: Mapping[str, HashedTest], milliseconds: Millisecond
     for task, of_task in rows.items():
         of_grid = [row for other, found in rows.items() if _grid(other) == _grid(task) for row in found]
         cells = [_with_most_months(of_grid, heuristic) for heuristic in ALONE.values()]
-        cells += [best_row([row for row in of_task if row.first.agent == agent]) for agent in ACTING.values()]
+        cells += [best_row([row for row in of_task if row.first.agent in agents]) for agents in ACTING.values()]
         highest = max((survival_of(row) for row in cells if row is not None), default=0.0)
         lines.append(markdown_row([short_id(task), *(_cell(row, highest, milliseconds or {}) for row in cells)]))
     return "\n".join(lines)
@@ -63,4 +63,6 @@ def _cell(row: LedgerRow | None, highest: float, milliseconds: Milliseconds) -> 
         return survival_cell(row, highest, "", remarks_on(row))
     took = milliseconds.get((short_id(test.task), test.agent, test.heuristic))
     times = [] if took is None else [f"{took[0]:.2g}, {took[1]:.2g} ms"]
-    return survival_cell(row, highest, f"`{test.heuristic}`" if test.heuristic else "", [*times, *remarks_on(row)])
+    named = [] if any(test.agent == agents[0] for agents in ACTING.values()) else [test.agent]
+    label = ", ".join([*named, *([f"`{test.heuristic}`"] if test.heuristic else [])])
+    return survival_cell(row, highest, label, [*times, *remarks_on(row)])

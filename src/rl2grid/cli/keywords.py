@@ -17,8 +17,8 @@ NAMES: tuple[str, ...] = tuple(option.name for option in options_without(*GIVEN_
 
 
 AGENT_HELP = (
-    "do-nothing, random, recovery, greedy, greedy-n1, milp, dc-opf, planner, rehearsal, foresight, a run folder or "
-    "checkpoint, pretrained/NAME, or one of your own as package.module:Agent or ./agent.py"
+    "do-nothing, random, recovery, greedy, greedy-n1, milp, dc-opf, planner, planner-open, rehearsal, foresight, a run "
+    "folder or checkpoint, pretrained/NAME, or one of your own as package.module:Agent or ./agent.py"
 )
 """What is played; a test compares it with the agents that there are."""
 

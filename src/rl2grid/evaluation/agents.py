@@ -14,6 +14,7 @@ from rl2grid.agents.greedy import Greedy
 from rl2grid.agents.greedy_topology import GreedyN1
 from rl2grid.agents.milp import Milp
 from rl2grid.agents.planner import Planner
+from rl2grid.agents.planner_open import PlannerOpen
 from rl2grid.agents.random_agent import RandomAgent
 from rl2grid.agents.recovery import Recovery
 from rl2grid.agents.rehearsal import Rehearsal
@@ -34,7 +35,8 @@ AGENTS: dict[str, Callable[[], Agent]] = {
     GreedyN1.name: GreedyN1,
     Milp.name: Milp,
     DcOpf.name: DcOpf,
-    "planner": Planner,
+    Planner.called: Planner,
+    PlannerOpen.called: PlannerOpen,
     Rehearsal.name: Rehearsal,
     Foresight.name: Foresight,
 }
