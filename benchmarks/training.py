@@ -176,8 +176,7 @@ def main() -> None:
         return options.only is None or name.startswith(tuple(options.only))
 
     result: dict[str, Any] = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
-    result["command"] = shlex.join(["python", "benchmarks/training.py", *sys.argv[1:]])
-    result["before"] = options.before
+    result["command"] = shlex.join(["python", "benchmarks/training.py", *sys.argv[1:]])  # the last one
     grids = [grid_of(task) for task in TASKS]
     with revision(options.before) as old:
         for name, (script, *arguments) in cases().items():
@@ -192,7 +191,8 @@ def main() -> None:
                     if number:
                         rates[side].append(rate)
             ratio = [now / before for now, before in zip(rates["now"], rates["before"], strict=True)]
-            entry = {side: summary(values) for side, values in rates.items()} | {"now_over_before": summary(ratio)}
+            entry: dict[str, Any] = {"revision_before": options.before}
+            entry |= {side: summary(values) for side, values in rates.items()} | {"now_over_before": summary(ratio)}
             if name.startswith("nothing"):
                 peer = [
                     run(ROOT, _GRID2OP, grid_of(arguments[0]), str(GRID2OP_STEPS))["decisions_per_s"]
