@@ -10,6 +10,7 @@ import rl2grid  # noqa: F401  (registers the tasks)
 from rl2grid.agents.contingencies import areas_to_attack, expected
 from rl2grid.agents.planner import Planner
 from rl2grid.agents.planner_open import PlannerOpen
+from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import kinds_of, make_agent
 from rl2grid.mdp.actions import ActionKind, full_catalogue
 
@@ -93,6 +94,11 @@ def test_against_others_it_plays_what_the_planner_plays(task: str):
                 break
         played.append(repr(actions))
     assert played[0] == played[1]
+
+
+def test_tasks_without_topology_are_refused():
+    with pytest.raises(UsageError, match="where no line can be closed: choose planner"):
+        PlannerOpen().bind(begun("bus14-R"))
 
 
 def test_it_is_found_by_name():

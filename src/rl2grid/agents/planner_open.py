@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
+import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
 from rl2grid.agents.contingencies import Contingencies, areas_to_attack, expected
 from rl2grid.agents.planner import Planner
+from rl2grid.errors import UsageError
 from rl2grid.mdp.state import GridState
 
 
@@ -25,6 +27,20 @@ class PlannerOpen(Planner):
 
     kinds: ClassVar[tuple[str, ...]] = ("T", "H")
     called: ClassVar[str] = "planner-open"
+
+    def bind(self, env: gymnasium.Env[Any, Any]) -> None:
+        """As the planner.
+
+        Raises:
+            UsageError: as the planner, or a redispatching task, where nobody closes lines.
+        """
+        base: Any = env.unwrapped
+        if not base.task.changes_topology:
+            raise UsageError(
+                f"Agent {self.called!r} cannot play {base.task.id}, where no line can be closed: choose planner, or a "
+                "task with topology."
+            )
+        super().bind(env)
 
     def _expected(self, state: GridState) -> Contingencies:
         return expected(self._grid, state, areas_to_attack(self._grid, state))
