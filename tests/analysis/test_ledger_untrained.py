@@ -35,3 +35,12 @@ def test_time_stands_beside_the_very_row_that_was_timed() -> None:
     line = untrained_table(RESULTS, milliseconds).splitlines()[2]
     assert "0.700 `idle` (2 months)" in line
     assert "**0.800** (4.7, 25 ms, 2 months)" in line
+
+
+def test_an_agent_that_its_column_is_not_called_after_is_named() -> None:
+    results = ledger(
+        on(BUS14, untrained("planner", [0.9, 0.7])),
+        on(BUS14, untrained("planner-open", [0.9, 0.9])),
+        on(BUS14, untrained("planner-open", [0.9, 0.95]), heuristic="idle"),
+    )
+    assert "| **0.925** planner-open, `idle` (2 months) |" in untrained_table(results).splitlines()[2]

@@ -14,8 +14,8 @@ from rl2grid.records.statistics import aggregated
 KINDS = ("do nothing", "search and rules", "planner", "learned")
 """What agents are told apart by: nothing is ever done; no training, but a model of the grid or a rule; sequences of
 actions on forecasts; learned."""
-DO_NOTHING, PLANNER = "do-nothing", "planner"
-PLANNERS = (PLANNER, "planner-open", "rehearsal")
+DO_NOTHING, PLANNER, PLANNER_OPEN = "do-nothing", "planner", "planner-open"
+PLANNERS = (PLANNER, PLANNER_OPEN, "rehearsal")
 """Agents of the third kind; cells name those that are not called like it."""
 USUAL_MONTHS = 500
 """Of the test list; a cell says the number where fewer were played."""

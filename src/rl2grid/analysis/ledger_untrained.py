@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from rl2grid.analysis.ledger_overview import (
     DO_NOTHING,
     PLANNER,
+    PLANNER_OPEN,
     best_row,
     by_task,
     remarks_on,
@@ -20,7 +21,7 @@ from rl2grid.records.ledger import HashedTest
 
 ALONE: Mapping[str, str | None] = {"do nothing": None, "`recovery`": "recovery", "`careful`": "careful"}
 """Heuristics under which nobody acts: a grid has one value of each, as none of what its tasks offer is chosen."""
-ACTING = {"greedy search": ("greedy",), "planner": (PLANNER, "planner-open"), "rehearsal": ("rehearsal",)}
+ACTING = {"greedy search": ("greedy",), "planner": (PLANNER, PLANNER_OPEN), "rehearsal": ("rehearsal",)}
 """Agents, of which each cell has the one, and the heuristic, that survives longest; it names all but the first."""
 
 Milliseconds = Mapping[tuple[str, str, str | None], tuple[float, float]]

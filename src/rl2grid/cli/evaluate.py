@@ -27,8 +27,6 @@ from rl2grid.records.evaluations import Evaluation
 from rl2grid.records.methods import Method, group_methods
 from rl2grid.scenarios.splits import SPLITS, TEST
 
-_PLANNER = "planner"
-
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add the flags of the command."""
@@ -69,7 +67,7 @@ def _run(options: argparse.Namespace, output: Output) -> int:
         raise UsageError("An agent was named twice: name each once.")
     if options.output is not None and len(agents) > 1:
         raise UsageError("--output is the folder of one agent: leave it out, and each gets a folder of its own.")
-    if options.seconds is not None and _PLANNER not in agents:
+    if options.seconds is not None and Planner.called not in agents:
         raise UsageError(f"--seconds is for the agent planner, which searches: leave it out for {', '.join(agents)}.")
     # Before anything is played: one that does not exist, or cannot play it, would be found after an hour of others.
     made = [_made(agent, task, options) for agent in agents]
@@ -103,7 +101,7 @@ def _run(options: argparse.Namespace, output: Output) -> int:
 
 
 def _made(agent: str, task: Task, options: argparse.Namespace) -> Agent:
-    if agent == _PLANNER and options.seconds is not None:
+    if agent == Planner.called and options.seconds is not None:
         return Planner(seconds=options.seconds)
     return make_agent(agent, task, **keywords.looking(options))
 
@@ -111,7 +109,7 @@ def _made(agent: str, task: Task, options: argparse.Namespace) -> Agent:
 def _own_flags(agent: str, options: argparse.Namespace) -> dict[str, str]:
     """Flags that say how this agent decides, and their values."""
     flags: dict[str, float] = {flag_of(name): value for name, value in keywords.looking(options).items()}
-    if agent == _PLANNER and options.seconds is not None:
+    if agent == Planner.called and options.seconds is not None:
         flags["seconds"] = options.seconds
     return {name: f"{value:g}" for name, value in flags.items()}
 
