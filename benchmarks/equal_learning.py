@@ -111,6 +111,8 @@ LOOPS: tuple[Loop, ...] = (
             },
         },
     ),
+    Loop("dqn", "bus14-T0", "careful", 61_440, {"no lag": {}, "lag": {"lag": 1}}),
+    Loop("sac", "bus14-T0", "careful", 61_440, {"no lag": {}, "lag": {"lag": 1}}),
 )  # fmt: skip
 
 

@@ -3,7 +3,8 @@
 ``python benchmarks/loop_speed.py [--seconds 8] [--only NAME ...]`` runs every algorithm for a while, after a warm-up,
 with its default hyperparameters, and writes ``benchmarks/results/loop_speed.json``. With one thread for everything:
 decisions and grid steps per second of processor time, and the share of it that the environments take. With two, for the
-environments and, in turn, for what learns: the same per second. Nothing else should run meanwhile.
+environments and, in turn, for what learns: the same per second. With two and a lag (DQN, SAC, TD3), which learn while
+environments play: likewise. Nothing else should run meanwhile.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import argparse
 import json
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -74,9 +76,14 @@ def measure(
     num_threads: int,
     seconds: float,
     clock: Callable[[], float],
+    **changes: Any,
 ) -> dict[str, float]:
-    """Rates of one loop per second of the clock, and with one thread the share of the environments."""
-    chosen = hyperparameters(algorithm, task, total_timesteps=100_000_000, num_envs=num_envs, **_small(algorithm))
+    """Rates of one loop per second of the clock, and with one thread the share of the environments.
+
+    ``changes`` are of the default hyperparameters.
+    """
+    changes = {"total_timesteps": 100_000_000, "num_envs": num_envs, **_small(algorithm), **changes}
+    chosen = hyperparameters(algorithm, task, **changes)
     arguments = RunArgs(task, chosen, algorithm, env_keywords={"heuristic": heuristic}, num_threads=num_threads)
     envs: Any = Timed(make_envs(arguments), clock)
     trainer = find_algorithm(algorithm).trainer(chosen, envs)
@@ -96,9 +103,14 @@ def measure(
     return rates | ({"environment_share": round(envs.seconds / elapsed, 3)} if num_threads == 1 else {})
 
 
+def _remembers(algorithm: str) -> bool:
+    """Whether it learns from a replay memory."""
+    return "buffer_bytes" in find_algorithm(algorithm).type_hints()
+
+
 def _small(algorithm: str) -> dict[str, Any]:
     """A replay memory is sized by its bytes, not by the budget."""
-    return {"buffer_bytes": 256 * 1024**2} if "buffer_bytes" in find_algorithm(algorithm).type_hints() else {}
+    return {"buffer_bytes": 256 * 1024**2} if _remembers(algorithm) else {}
 
 
 def main() -> None:
@@ -113,12 +125,14 @@ def main() -> None:
         name = f"{algorithm} {task} {heuristic or 'plain'} {num_envs}"
         if options.only is not None and not name.startswith(tuple(options.only)):
             continue
-        results[name] = {"seconds": options.seconds} | {
-            words: measure(
-                algorithm, task, heuristic, num_envs, num_threads=count, seconds=options.seconds, clock=clock
-            )
-            for words, count, clock in (("one thread", 1, time.process_time), ("two threads", 2, time.perf_counter))
+        rates = partial(measure, algorithm, task, heuristic, num_envs, seconds=options.seconds)
+        results[name] = {
+            "seconds": options.seconds,
+            "one thread": rates(num_threads=1, clock=time.process_time),
+            "two threads": rates(num_threads=2, clock=time.perf_counter),
         }
+        if _remembers(algorithm):
+            results[name]["two threads, lag"] = rates(num_threads=2, clock=time.perf_counter, lag=1)
         print(name, results[name], flush=True)
         write_json(RESULTS, results, indent=1)
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import math
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -333,9 +335,43 @@ def test_another_seed_gives_other_weights_and_episodes(kind: str):
 
 
 @ALL
-@pytest.mark.parametrize("in_files", [False, True], ids=["state", "files"])
-def test_a_resumed_run_ends_with_the_weights_of_one_that_was_not_interrupted(kind: str, in_files: bool, tmp_path: Path):
-    changes = {"buffer_size": 150, "last_learning_rate_share": 0.1}  # forgets on the way
+@pytest.mark.parametrize("threads", [1, 2])
+def test_with_a_lag_the_policy_that_plays_is_a_step_behind_whoever_is_faster(kind: str, threads: int):
+    class Threaded(Recording):
+        num_threads = threads
+
+        def step(self, actions: Any) -> Any:
+            time.sleep(0.001 * (len(self.actions) % 3))
+            return super().step(actions)
+
+    one, plain = (trainer(kind, Threaded(4, continuous=MADE[kind][2]), lag=1), trainer(kind))
+    seen: list[tuple[int, int]] = []
+    explore = one.explore
+    one.explore = lambda *given: (seen.append((one.decisions, one.updates)), explore(*given))[1]
+    while not one.finished:
+        one.iterate()
+        plain.iterate()
+    due = [max((decisions - 40) // 4, 0) for decisions, _ in seen]
+    assert [updates for _, updates in seen] == [0, *due[:-1]]
+    assert one.updates == plain.updates  # the last ones are made when nothing is played any more
+    assert_same(learned(one), _learned_in_turn(kind))
+
+
+@functools.cache
+def _learned_in_turn(kind: str) -> dict[str, Any]:
+    """What is learned with a lag where nothing happens at once."""
+    one = trainer(kind, lag=1)
+    while not one.finished:
+        one.iterate()
+    return learned(one)
+
+
+@ALL
+@pytest.mark.parametrize(("in_files", "lag"), [(False, 0), (True, 0), (True, 1)], ids=["state", "files", "lag"])
+def test_a_resumed_run_ends_with_the_weights_of_one_that_was_not_interrupted(
+    kind: str, in_files: bool, lag: int, tmp_path: Path
+):
+    changes = {"buffer_size": 150, "last_learning_rate_share": 0.1, "lag": lag}  # forgets on the way
     straight = trainer(kind, **changes)
     metrics = [straight.iterate() for _ in range(straight.num_iterations)][-1]
     for stop in (1, 3, 5):
@@ -421,6 +457,7 @@ def test_metrics_of_episodes_are_those_of_the_episodes(kind: str):
         ({"gamma": math.nan}, "gamma between 0 and 1"),
         ({"gamma": 1.0}, "reward_scale"),
         ({"seed": -1}, "seed of at least 0"),
+        ({"lag": 2}, "lag of 0 or 1, not 2"),
         ({"device": "gpu"}, "choose one of auto, cpu, cuda"),
         ({"total_timesteps": 63}, "at least num_envs . num_steps = 64, not 63"),
     ],

@@ -15,6 +15,10 @@ When it learns
     four after every step. An iteration plays ``num_steps`` decisions per environment; metrics are written and
     checkpoints are possible between two iterations.
 
+    With a lag of 1 the updates that a step made due are made while the next one is played, on two cores at once: the
+    policy that chose its actions does not know them yet. Which updates those are follows from the decisions alone, so
+    that results depend on the lag, and never on who is faster. The run ends with all updates that are due.
+
 Observations
     The memory holds them as the environment gives them. They are scaled by running statistics shared by all
     environments when they are used, so that old ones are scaled like new ones.
@@ -30,21 +34,25 @@ from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from gymnasium.vector import VectorEnv
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from rl2grid.algorithms.descent import Adam, descend
-from rl2grid.algorithms.hyperparameters import SharedArgs
+from rl2grid.algorithms.hyperparameters import SharedArgs, added_later
 from rl2grid.algorithms.networks import VALUE_OF_ACTION, NetworkFactory
+from rl2grid.algorithms.pair import Pair
 from rl2grid.algorithms.playing import Tally
 from rl2grid.algorithms.replay import ReplayMemory, Step, computer_memory
 from rl2grid.algorithms.sampling import drawn
-from rl2grid.algorithms.trainer import Trainer
+from rl2grid.algorithms.trainer import Answer, Trainer
+from rl2grid.errors import UsageError
 
 # --- Hyperparameters ------------------------------------------------------------------------------------------------
 
@@ -74,6 +82,8 @@ class OffPolicyArgs(SharedArgs):
     last_learning_rate_share: float = 1.0
     """Share of the learning rates that is left at the end of the run, to which they fall linearly with the decisions;
     1: they stay."""
+    lag: int = added_later(0)
+    """Steps of the environments by which updates come later: 0, or 1, while the environments play the next one."""
     device: str = "cpu"
     """Where networks are: ``cpu``, ``cuda``, or ``auto``: a GPU if there is one. Others than the CPU need not be
     reproducible."""
@@ -84,6 +94,8 @@ class OffPolicyArgs(SharedArgs):
         self._check_counts("train_frequency", "batch_size", "buffer_size")
         self._check_not_negative("learning_starts")
         self._check_shares("buffer_memory_share", "last_learning_rate_share")
+        if self.lag not in (0, 1):
+            raise UsageError(f"{self.algorithm} needs a lag of 0 or 1, not {self.lag}.")
 
 
 # --- Networks -------------------------------------------------------------------------------------------------------
@@ -197,6 +209,7 @@ class OffPolicyTrainer(Trainer):
         )
         self.updates = 0
         """Minibatches learned from so far."""
+        self._pair = Pair(getattr(envs.unwrapped, "num_threads", 1) > 1)
 
     @abstractmethod
     def explore(self, observations: Tensor, masks: Tensor | None) -> Tensor:
@@ -226,9 +239,12 @@ class OffPolicyTrainer(Trainer):
         self._set_learning_rates()
         tally, history = Tally(), _History()
         for _ in range(self.args.num_steps):
-            self._play(tally)
-            self._improve(history)
+            self._play(tally, history)
+            if not self.args.lag:
+                self._improve(history)
         self.iteration += 1
+        if self.finished:
+            self._improve(history)
         return {
             **tally.metrics(),
             "charts/grid_steps": float(self.grid_steps),
@@ -282,15 +298,16 @@ class OffPolicyTrainer(Trainer):
                 for group in optimizer.param_groups:
                     group["lr"] = share * group.setdefault("initial_lr", group["lr"])
 
-    def _play(self, tally: Tally) -> None:
-        """One decision in every environment, remembered."""
+    def _play(self, tally: Tally, history: _History) -> None:
+        """One decision in every environment, remembered; with a lag, what was due before is learned meanwhile."""
         args, observations = self.args, self.observations
         assert observations is not None
         masks = self.masks()
         with torch.no_grad():
             shown = self.normalized(observations)
             actions = self.explore(shown, None if masks is None else torch.as_tensor(masks)).cpu()
-        played = self.step(actions.numpy(), tally)
+        answer = self._answers(actions.numpy(), history) if args.lag else self.answers(actions.numpy())
+        played = self.counted(answer, tally)
         ended_well = np.flatnonzero(played.completed).tolist()
         self.memory.add(
             Step(
@@ -305,6 +322,11 @@ class OffPolicyTrainer(Trainer):
             )
         )
         self.see(played.observations)
+
+    def _answers(self, actions: NDArray[Any], history: _History) -> Answer:
+        """What the environments answer; the updates that are due are made meanwhile."""
+        _, answer = self._pair.run(partial(self._improve, history), partial(self.answers, actions))
+        return answer
 
     def _improve(self, history: _History) -> None:
         """Learn as often as is due."""

@@ -71,6 +71,18 @@ class Played(NamedTuple):
         return [self.infos["final_obs"][i] for i in np.flatnonzero(self.completed)]
 
 
+class Answer(NamedTuple):
+    """What ``VectorEnv.step`` returned."""
+
+    observations: NDArray[np.float32]
+    rewards: NDArray[np.float64]
+    terminated: NDArray[np.bool_]
+    truncated: NDArray[np.bool_]
+    infos: Mapping[str, Any]
+    seconds: float
+    """that it took"""
+
+
 class Learner(ABC):
     """What learns: ``iterate`` until ``finished``; ``state_dict`` between two iterations holds all of it."""
 
@@ -341,11 +353,21 @@ class Trainer(Learner):
         Raises:
             UsageError: the environments play several grid steps per decision and do not tell what they are worth.
         """
-        decided = ~self._over
-        begin = time.perf_counter()
-        observations, rewards, terminated, truncated, infos = self.envs.step(actions)
-        seconds = time.perf_counter() - begin
+        return self.counted(self.answers(actions), tally)
 
+    def answers(self, actions: NDArray[Any]) -> Answer:
+        """What the environments answer to a decision in each, and how long that took; nothing else is touched."""
+        begin = time.perf_counter()
+        return Answer(*self.envs.step(actions), seconds=time.perf_counter() - begin)
+
+    def counted(self, answer: Answer, tally: Tally) -> Played:
+        """Count what the environments answered.
+
+        Raises:
+            UsageError: the environments play several grid steps per decision and do not tell what they are worth.
+        """
+        observations, rewards, terminated, truncated, infos, seconds = answer
+        decided = ~self._over
         ended = terminated | truncated
         self._over = reported(infos, "over", np.zeros_like(ended)) & ended
         n_steps = of_transition(infos, "n_steps", ended, np.ones(self.args.num_envs, np.int64))
