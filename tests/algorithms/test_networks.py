@@ -145,7 +145,7 @@ def test_observations_that_it_cannot_read_and_tasks_without_grid_are_refused():
     with pytest.raises(UsageError, match=r"'lines' reads observations as .*: set normalize_observations to False"):
         find_algorithm("ppo").trainer(args("ppo", "bus14-T0", normalize_observations=True), envs)
     with pytest.raises(
-        UsageError, match="'transformer' does not exist: choose one of mlp, action-embedding, gnn, lines"
+        UsageError, match="'transformer' does not exist: choose one of mlp, action-embedding, gnn, set-point, lines"
     ):
         find_algorithm("ppo").trainer(args("ppo", "bus14-T0", network="transformer"), envs)
     envs.close()
@@ -157,7 +157,7 @@ def test_observations_that_it_cannot_read_and_tasks_without_grid_are_refused():
 
 
 def test_names_are_given_once():
-    assert network_names() == ("mlp", "action-embedding", "gnn", "lines")
+    assert network_names() == ("mlp", "action-embedding", "gnn", "set-point", "lines")
     register_network(Network("lines", Lines, reads_normalized=False, needs_grid=True))
     with pytest.raises(UsageError, match="'lines' exists already"):
         register_network(Network("lines", Lines))
@@ -170,7 +170,7 @@ def test_installed_packages_offer_theirs(monkeypatch: pytest.MonkeyPatch):
     points = [SimpleNamespace(name="theirs", load=lambda: theirs), SimpleNamespace(name="wrong", load=lambda: Lines)]
     monkeypatch.setattr(networks, "entry_points", lambda group: points if group == "rl2grid.networks" else [])
     monkeypatch.setattr(networks, "_installed", networks._installed.__wrapped__)
-    assert network_names() == ("mlp", "action-embedding", "gnn", "theirs", "wrong", "lines")
+    assert network_names() == ("mlp", "action-embedding", "gnn", "set-point", "theirs", "wrong", "lines")
     assert find_network("theirs") is theirs
     with pytest.raises(UsageError, match="'wrong' is offered by an entry point that is no Network"):
         find_network("wrong")

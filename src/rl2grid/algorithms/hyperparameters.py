@@ -59,8 +59,8 @@ class SharedArgs:
     normalize_observations: bool = True
     """Whether observations are scaled by running statistics shared by all environments."""
     network: str = added_later("mlp")
-    """Name of the kind of networks: ``mlp``, layers one after the other, ``action-embedding``, ``gnn``, or one of your
-    own."""
+    """Name of the kind of networks: ``mlp``, layers one after the other, ``action-embedding``, ``gnn``, for continuous
+    actions ``set-point``, or one of your own."""
     shortlist: int | None = added_later(None)
     """Discrete actions only: among how many it chooses, do nothing and the best-ranked ones; None: all."""
     joint_actions: str | None = added_later(None)

@@ -146,6 +146,7 @@ _IN_PACKAGE = {
     "mlp": "rl2grid.algorithms.networks.mlp",
     "action-embedding": "rl2grid.algorithms.networks.action_embedding",
     "gnn": "rl2grid.algorithms.networks.gnn",
+    "set-point": "rl2grid.algorithms.networks.set_point",
 }
 """The file of each, whose ``NETWORK`` describes it."""
 _ADDED: dict[str, Network] = {}

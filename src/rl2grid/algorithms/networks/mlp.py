@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from rl2grid.algorithms.networks import Network, Request
+from rl2grid.algorithms.networks import Network, Request, Style
 from rl2grid.arrays import I64
 from rl2grid.dense.layers import (
     LINEAR,
@@ -125,14 +125,21 @@ class _Dense(torch.autograd.Function):
 def build(request: Request) -> Layers:
     """Linear layers of the widths asked for, with activations in between."""
     widths = (request.output.inputs(request.spec), *request.layers, request.output.width(request.spec))
+    layers = stacked(widths, request.style, request.generator)
+    if request.first_action is not None:
+        last: Any = layers[-1]
+        with torch.no_grad():
+            last.bias[request.output.per_state] = request.first_action
+    return layers
+
+
+def stacked(widths: Sequence[int], style: Style, generator: torch.Generator | None) -> Layers:
+    """Linear layers between these widths, with activations in between."""
     modules: list[nn.Module] = []
     for k, (inputs, outputs) in enumerate(itertools.pairwise(widths)):
         last = k == len(widths) - 2
-        layer = request.style.linear(inputs, outputs, last=last, generator=request.generator)
-        modules += [layer] if last else [layer, request.style.activation()]
-    if request.first_action is not None:
-        with torch.no_grad():
-            layer.bias[request.output.per_state] = request.first_action
+        layer = style.linear(inputs, outputs, last=last, generator=generator)
+        modules += [layer] if last else [layer, style.activation()]
     return Layers(*modules)
 
 
