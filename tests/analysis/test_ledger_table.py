@@ -82,6 +82,16 @@ def test_another_network_than_an_mlp_is_named():
     assert trained(1, [0.6, 0.8]).label == "ppo + idle"
 
 
+def test_rows_are_compared_with_the_reference_by_its_present_rules():
+    results = ledger(
+        untrained("do-nothing", [0.1, 0.2]),
+        untrained("planner", [0.8, 0.9]),
+        untrained("planner", [0.5, 0.7], rules=2),
+    )
+    table = ledger_table(results, TASK, "planner")
+    assert cells(table, "bus14-T0 do-nothing")["to planner"].startswith("-0.450 [")
+
+
 def test_what_later_rules_of_an_agent_replaced_is_marked_and_left_out_of_short_tables():
     results = ledger(
         untrained("do-nothing", [0.1, 0.2]), untrained("planner", [0.7, 0.8]), untrained("planner", [0.6, 0.8], rules=2)

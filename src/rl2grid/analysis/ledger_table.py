@@ -23,6 +23,7 @@ from rl2grid.records.versions import TARGETS_VERSION
 
 REFERENCE = "do-nothing"
 """What rows are compared with unless another is named, where it has had its test."""
+_EARLIER_RULES = "r"
 LEGEND = (
     "Test survival: mean over seeds and months, 95% interval over both; of one training, or none, over months alone. "
     "Last: of the last policies of the runs, where they are not the best by validation. {heading}: paired difference "
@@ -203,7 +204,7 @@ def _marks(
     first = group[0]
     seen = len(earlier_choices(results, method_of(first), first.choice))
     marks = [f"a{seen}"] if seen else []
-    marks += ["r"] if is_outdated(first, latest) else []
+    marks += [_EARLIER_RULES] if is_outdated(first, latest) else []
     if first.training:
         marks += ["b"] if budget(first) != usual[first.task, first.heuristic] else []
         marks += ["s"] if any(one.training.get("tested_before") for one in group) else []
@@ -213,11 +214,12 @@ def _marks(
 
 
 def _compared(rows: Sequence[LedgerRow], reference: str) -> dict[int, Difference | str]:
-    """Difference of each row to the reference of its task, or why there is none."""
+    """Difference of each row to the reference of its task, by present rules if possible, or why there is none."""
     found: dict[int, Difference | str] = {}
     for _, group in itertools.groupby(enumerate(rows), key=lambda one: one[1].first.task):
         numbered = dict(group)
-        base = next((row for row in numbered.values() if row.first.label == reference), None)
+        alike = [row for row in numbered.values() if row.first.label == reference]
+        base = min(alike, key=lambda row: _EARLIER_RULES in row.marks.split(), default=None)
         if base is None:
             continue
         others = {number: row for number, row in numbered.items() if row is not base}
