@@ -43,7 +43,7 @@ def test_it_is_the_policy_that_its_card_says_and_plays(card: ModelCard):
     assert agent.task == find_task(card.task).id
     assert agent.env_keywords.get("heuristic") == card.heuristic
     register_all()
-    env = gymnasium.make(agent.task, heuristic=card.heuristic)
+    env = gymnasium.make(agent.task, **agent.env_keywords)
     agent.bind(env)
     observation, info = env.reset(seed=5)
     agent.reset(0)
