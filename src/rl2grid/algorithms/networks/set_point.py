@@ -34,7 +34,7 @@ from rl2grid.mdp.features import OPERATOR_FEATURES, physical_scale
 
 NAME = "set-point"
 GIVEN = (
-    "t", "load_p", "time_before_cooldown_line", "topo_vect", "line_status", "timestep_overflow",
+    "t", "load_p", "time_before_cooldown_line", "topo_vect", "line_status",
     "time_before_cooldown_sub", "gen_p_before_curtail", "duration_next_maintenance", "storage_charge",
     *OPERATOR_FEATURES["calendar"], *OPERATOR_FEATURES["attacks"],
 )  # fmt: skip
