@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from rl2grid.algorithms.networks import Network, Output, Request
 from rl2grid.algorithms.networks.action_table import KINDS, Places, action_table, first_table, with_first
+from rl2grid.algorithms.networks.constants import keep
 from rl2grid.algorithms.networks.mlp import Layers
 
 WIDTH = 64
@@ -30,8 +31,7 @@ class ActionEmbedding(nn.Module):
         spec = request.spec
         assert spec.grid is not None
         names = ("kinds", "places", "elements", "offsets")
-        for name, tensor in zip(names, action_table(spec).tensors(), strict=True):
-            self.register_buffer(name, tensor, persistent=False)
+        keep(self, **dict(zip(names, action_table(spec).tensors(), strict=True)))
         self.of_kind = request.style.linear(len(KINDS), width, last=False, generator=request.generator)
         self.of_place = nn.Parameter(first_table(len(Places.of(spec.grid)), width, request))
         if len(self.elements):

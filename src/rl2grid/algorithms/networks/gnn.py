@@ -39,6 +39,7 @@ from rl2grid.algorithms.networks.action_table import (
     action_table,
     first_table,
 )
+from rl2grid.algorithms.networks.constants import URGENT_STEPS, keep, urgency
 from rl2grid.algorithms.networks.graph_functions import (
     Busbars,
     Incidence,
@@ -57,8 +58,6 @@ from rl2grid.envs.spec import Spec
 from rl2grid.envs.tasks import find_task
 from rl2grid.mdp.features import operator_line_features, physical_scale
 
-_URGENT_STEPS = 72.0
-"""Steps after which planned maintenance counts e times less: six hours."""
 _STRESSED = 0.9
 """Loading from which a line's loading counts once more, five times as much."""
 _SHARE, _LEAST_WIDTH = 16, 8
@@ -113,8 +112,7 @@ class Features(nn.Module):
             "load_size": torch.tensor(scale[self.slices["load_p"]] / largest).unsqueeze(-1),
             "renewable": torch.tensor(grid.gen_renewable, dtype=torch.float32).unsqueeze(-1),
         }
-        for name, tensor in kept.items():
-            self.register_buffer(name, tensor, persistent=False)
+        keep(self, **kept)
         controls = _controls(spec) if reads_action else ()
         for kind, (entries, units) in enumerate(controls):
             self.register_buffer(f"entries_{kind}", entries, persistent=False)
@@ -166,7 +164,7 @@ class Features(nn.Module):
     def _lines(self, part: dict[str, Tensor], in_service: Tensor, second: Tensor) -> Tensor:
         rho, n_line = part["rho"], self.grid.n_line
         steps = part["time_next_maintenance"] * self.scale[self.slices["time_next_maintenance"]].unsqueeze(-1)
-        announced = (steps.clamp(min=0.0) / -_URGENT_STEPS).exp() * steps.clone().ge_(0.0)
+        announced = urgency(steps / URGENT_STEPS)
         columns = [
             rho,
             (rho - _STRESSED).clamp(min=0.0) * 5.0,
@@ -370,8 +368,7 @@ class _Scores(nn.Module):
             "elements": elements_of_rows.clamp(min=0),
             "is_moved": (elements_of_rows >= 0).to(torch.float32).unsqueeze(-1),
         }
-        for name, tensor in kept.items():
-            self.register_buffer(name, tensor, persistent=False)
+        keep(self, **kept)
 
     kinds: Tensor
     at_subs: Tensor

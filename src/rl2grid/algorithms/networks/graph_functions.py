@@ -14,6 +14,8 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from rl2grid.algorithms.networks.constants import keep
+
 _TILE = 2**17
 """Numbers of the hidden layer that are held at a time while actions are scored: half a megabyte."""
 
@@ -37,9 +39,7 @@ class RowSums(nn.Module):
         super().__init__()
         order = torch.argsort(sums, stable=True)
         begins = torch.searchsorted(sums[order], torch.arange(n_sums))
-        kept = {"rows": rows[order], "begins": begins, "weights": None if weights is None else weights[order]}
-        for name, tensor in kept.items():
-            self.register_buffer(name, tensor, persistent=False)
+        keep(self, rows=rows[order], begins=begins, weights=None if weights is None else weights[order])
         self.bounds: list[int] = [*begins.tolist(), len(rows)]
 
     rows: Tensor
@@ -80,8 +80,7 @@ class Incidence(nn.Module):
         n_rows = int(rows.max()) + 1
         self.to_subs = RowSums(subs, rows, n_sub, per_sub[subs])
         self.to_rows = RowSums(rows, subs, n_rows)
-        for name, tensor in (("subs", subs), ("rows", rows), ("per_sub", per_sub)):
-            self.register_buffer(name, tensor, persistent=False)
+        keep(self, subs=subs, rows=rows, per_sub=per_sub)
 
     subs: Tensor
     rows: Tensor

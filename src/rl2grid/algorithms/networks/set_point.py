@@ -17,13 +17,12 @@ dispatch is taken off. Inputs are observations as the environment gives them, in
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from rl2grid.algorithms.networks import PER_ACTION, Network, Request
+from rl2grid.algorithms.networks.constants import URGENT_STEPS, keep, urgency
 from rl2grid.algorithms.networks.mlp import Layers, build, stacked
 from rl2grid.arrays import I64
 from rl2grid.envs.spec import JointActions, Spec
@@ -39,8 +38,6 @@ GIVEN = (
     *OPERATOR_FEATURES["calendar"], *OPERATOR_FEATURES["attacks"],
 )  # fmt: skip
 """Features that are read as they are."""
-URGENT_STEPS = 72.0
-"""Steps after which planned maintenance counts e times less: six hours."""
 
 
 class Given(nn.Module):
@@ -54,14 +51,13 @@ class Given(nn.Module):
         assert spec.scale is not None
         self.slices = {feature.name: slice(feature.begin, feature.end) for feature in spec.features}
         shift, scale = physical_scale(spec.grid, find_task(spec.task).kind, spec.operator_features)
-        kept = {
-            "shift": torch.tensor((spec.shift - shift) / scale),
-            "scale": torch.tensor(spec.scale / scale),
-            "read": torch.from_numpy(_entries(self.slices)),
-            "steps": torch.tensor(scale[self.slices["time_next_maintenance"]] / URGENT_STEPS),
-        }
-        for name, tensor in kept.items():
-            self.register_buffer(name, tensor, persistent=False)
+        keep(
+            self,
+            shift=torch.tensor((spec.shift - shift) / scale),
+            scale=torch.tensor(spec.scale / scale),
+            read=torch.from_numpy(_entries(self.slices)),
+            steps=torch.tensor(scale[self.slices["time_next_maintenance"]] / URGENT_STEPS),
+        )
         self.size = len(self.read) + spec.grid.n_gen + 2 * spec.grid.n_line
 
     shift: Tensor
@@ -74,9 +70,8 @@ class Given(nn.Module):
         entries = observations * self.scale + self.shift
         schedule = entries[:, self.slices["gen_p"]] - entries[:, self.slices["actual_dispatch"]]
         is_out = (entries[:, self.slices["rho"]] == 0.0).to(entries.dtype)
-        steps = entries[:, self.slices["time_next_maintenance"]] * self.steps
-        urgency = torch.exp(-steps.clamp(min=0.0)) * (steps >= 0.0)
-        return torch.cat([entries[:, self.read], schedule, is_out, urgency], dim=1)
+        announced = urgency(entries[:, self.slices["time_next_maintenance"]] * self.steps)
+        return torch.cat([entries[:, self.read], schedule, is_out, announced], dim=1)
 
 
 def _entries(slices: dict[str, slice]) -> I64:
@@ -100,16 +95,15 @@ class SetPoints(nn.Module):
         if n_topology:
             self.topology = stacked((spec.observation_size, *request.layers, n_topology), *draws)
         target = spec.feature("target_dispatch").begin + gens
-        kept: dict[str, Any] = {
-            "targets": torch.from_numpy(target.astype(np.int64)),
-            "shift": torch.tensor(spec.shift[target]),
-            "scale": torch.tensor(spec.scale[target]),
-            "largest": torch.tensor(grid.gen_pmax[gens]),
-            "ramp_up": torch.tensor(grid.gen_max_ramp_up[gens]),
-            "ramp_down": torch.tensor(grid.gen_max_ramp_down[gens]),
-        }
-        for name, tensor in kept.items():
-            self.register_buffer(name, tensor, persistent=False)
+        keep(
+            self,
+            targets=torch.from_numpy(target.astype(np.int64)),
+            shift=torch.tensor(spec.shift[target]),
+            scale=torch.tensor(spec.scale[target]),
+            largest=torch.tensor(grid.gen_pmax[gens]),
+            ramp_up=torch.tensor(grid.gen_max_ramp_up[gens]),
+            ramp_down=torch.tensor(grid.gen_max_ramp_down[gens]),
+        )
 
     targets: Tensor
     shift: Tensor
