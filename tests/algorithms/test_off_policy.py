@@ -344,7 +344,7 @@ def test_with_a_lag_the_policy_that_plays_is_a_step_behind_whoever_is_faster(kin
             time.sleep(0.001 * (len(self.actions) % 3))
             return super().step(actions)
 
-    one, plain = (trainer(kind, Threaded(4, continuous=MADE[kind][2]), lag=1), trainer(kind))
+    one, plain = trainer(kind, Threaded(4, continuous=MADE[kind][2]), lag=1), trainer(kind)
     seen: list[tuple[int, int]] = []
     explore = one.explore
     one.explore = lambda *given: (seen.append((one.decisions, one.updates)), explore(*given))[1]

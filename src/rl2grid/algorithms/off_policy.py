@@ -209,7 +209,7 @@ class OffPolicyTrainer(Trainer):
         )
         self.updates = 0
         """Minibatches learned from so far."""
-        self._pair = Pair(getattr(envs.unwrapped, "num_threads", 1) > 1)
+        self._pair = Pair(self.num_threads > 1)
 
     @abstractmethod
     def explore(self, observations: Tensor, masks: Tensor | None) -> Tensor:

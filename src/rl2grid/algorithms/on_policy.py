@@ -398,7 +398,7 @@ class OnPolicyTrainer(Trainer):
         groups = [{"params": list(critic.parameters())} for critic in critics]
         self.actor_optimizer = Adam(self.network.actor_parameters(), lr=args.actor_learning_rate, eps=1e-5)
         self.critic_optimizer = Adam(groups, lr=args.critic_learning_rate, eps=1e-5)
-        self._pair = Pair(getattr(envs.unwrapped, "num_threads", 1) > 1 and self.device.type == "cpu")
+        self._pair = Pair(self.num_threads > 1 and self.device.type == "cpu")
         self.teacher: ActorCritic | None = None
         """What the policy was at the beginning, if it is that of another run."""
         self._divergences: list[Tensor] = []

@@ -293,6 +293,8 @@ class Trainer(Learner):
         check_discount(args.algorithm, envs, args.gamma)
         super().__init__(args, spec_of(envs), getattr(envs.unwrapped, "options", None))
         self.envs = envs
+        self.num_threads: int = getattr(envs.unwrapped, "num_threads", 1)
+        """Of the environments; where there are several, learning may use a second one."""
         self.observations: NDArray[np.float32] | None = None
         """What the environments show, as they give it."""
         self._over = np.zeros(args.num_envs, np.bool_)

@@ -23,7 +23,6 @@ from rl2grid.records.versions import TARGETS_VERSION
 
 REFERENCE = "do-nothing"
 """What rows are compared with unless another is named, where it has had its test."""
-_EARLIER_RULES = "r"
 LEGEND = (
     "Test survival: mean over seeds and months, 95% interval over both; of one training, or none, over months alone. "
     "Last: of the last policies of the runs, where they are not the best by validation. {heading}: paired difference "
@@ -64,6 +63,8 @@ class LedgerRow:
     """What the legend explains."""
     told_by: str
     """The hyperparameters that tell it from rows of the same label and budget; empty where there are none."""
+    is_outdated: bool
+    """Whether it is by earlier rules than another row of its agent; see :func:`is_outdated`."""
 
     @property
     def first(self) -> HashedTest:
@@ -168,7 +169,7 @@ def ledger_rows(shown: Mapping[str, HashedTest], results: Mapping[str, HashedTes
     usual = {key: max(counts, key=lambda one: (counts[one], dict(one)["decisions"])) for key, counts in budgets.items()}
     told_by, latest = _told_by([first for first, *_ in groups]), latest_rules(results)
     return [
-        LedgerRow(tuple(group), _marks(group, usual, latest, results), words)
+        LedgerRow(tuple(group), _marks(group, usual, latest, results), words, is_outdated(group[0], latest))
         for group, words in zip(groups, told_by, strict=True)
     ]
 
@@ -204,7 +205,7 @@ def _marks(
     first = group[0]
     seen = len(earlier_choices(results, method_of(first), first.choice))
     marks = [f"a{seen}"] if seen else []
-    marks += [_EARLIER_RULES] if is_outdated(first, latest) else []
+    marks += ["r"] if is_outdated(first, latest) else []
     if first.training:
         marks += ["b"] if budget(first) != usual[first.task, first.heuristic] else []
         marks += ["s"] if any(one.training.get("tested_before") for one in group) else []
@@ -219,7 +220,7 @@ def _compared(rows: Sequence[LedgerRow], reference: str) -> dict[int, Difference
     for _, group in itertools.groupby(enumerate(rows), key=lambda one: one[1].first.task):
         numbered = dict(group)
         alike = [row for row in numbered.values() if row.first.label == reference]
-        base = min(alike, key=lambda row: _EARLIER_RULES in row.marks.split(), default=None)
+        base = min(alike, key=lambda row: row.is_outdated, default=None)
         if base is None:
             continue
         others = {number: row for number, row in numbered.items() if row is not base}
