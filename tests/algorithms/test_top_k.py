@@ -11,7 +11,7 @@ import pytest
 
 import rl2grid
 from rl2grid.algorithms.policy_agent import PolicyAgent, load_agent
-from rl2grid.algorithms.top_k import TopK
+from rl2grid.algorithms.top_k import WIDTH, TopK
 from rl2grid.envs.registration import register_all
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import make_agent
@@ -19,24 +19,22 @@ from rl2grid.mdp.heuristics import SAFE_RHO
 from rl2grid.training import request, runs
 
 
-def trained(folder: Path, task: str) -> Path:
+def trained(folder: Path, task: str, algorithm: str = "ppo", **changes: Any) -> Path:
     """A policy that has hardly learned anything, and therefore tries many actions."""
-    chosen = request.hyperparameters(
-        "ppo",
-        task,
-        total_timesteps=64,
-        num_envs=4,
-        num_steps=16,
-        **({"initial_do_nothing": None} if "T" in task else {}),
-    )
+    chosen = request.hyperparameters(algorithm, task, total_timesteps=64, num_envs=4, num_steps=16, **changes)
     return runs.train(
-        request.RunArgs(task, chosen, "ppo", folder, validation_months=0, tensorboard=False, progress=False)
+        request.RunArgs(task, chosen, algorithm, folder, validation_months=0, tensorboard=False, progress=False)
     )
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return trained(tmp_path_factory.mktemp("top-k") / "run", "bus14-T0")
+    return trained(tmp_path_factory.mktemp("top-k") / "run", "bus14-T0", initial_do_nothing=None)
+
+
+@pytest.fixture(scope="module")
+def continuous_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return trained(tmp_path_factory.mktemp("top-k") / "continuous", "bus14-R")
 
 
 def played(agent: Any, decisions: int, engine: str = "native") -> list[tuple[int, Any, Any]]:
@@ -108,10 +106,73 @@ def test_it_is_named_identified_and_made_by_its_run(run: Path):
     assert result.summary.agent == "ppo, best of 4"
 
 
-def test_what_has_no_best_few_actions_is_refused(run: Path, tmp_path: Path):
+def foreseen(env: Any, action: Any) -> float:
+    """The worst loading in the next step; infinite where the game would be lost, or the action refused."""
+    result = env.unwrapped.simulate(action)
+    if result.terminated or result.info["illegal"]:
+        return np.inf
+    return float(result.observation[env.unwrapped.observation_slices["rho"]].max())
+
+
+def test_continuous_actions_are_drawn_where_the_most_probable_one_is_not_safe(continuous_run: Path):
+    register_all()
+    env = gymnasium.make("rl2grid/bus14-R-v0", heuristic="idle")
+    policy, agent = load_agent(continuous_run), TopK(load_agent(continuous_run), 6)
+    for each in (policy, agent):
+        each.bind(env)
+        each.seed_episode(0, 7)
+    places = []
+    for seed in range(12):
+        observation, info = env.reset(seed=seed)
+        for _ in range(4):
+            if info["over"]:
+                break
+            first = policy.act(observation, info)
+            candidates = [first]
+            loading = [foreseen(env, first)]
+            if loading[0] >= SAFE_RHO:
+                candidates += policy.draws(observation, 5, WIDTH)
+                loading += [foreseen(env, each) for each in candidates[1:]]
+            safe = [k for k, each in enumerate(loading) if each < SAFE_RHO]
+            expected = safe[0] if safe else int(np.argmin(loading))
+            np.testing.assert_array_equal(agent.act(observation, info), candidates[expected])
+            considered = agent.explain()
+            assert considered is not None
+            assert list(considered.values) == loading
+            assert all(np.abs(each).max() <= 1.0 for each in candidates)
+            places.append(expected)
+            observation, _, terminated, truncated, info = env.step(candidates[expected])
+            if terminated or truncated:
+                break
+    env.close()
+    assert len(set(places)) > 2, "the draws never changed anything"
+
+
+def test_what_is_drawn_follows_from_the_episode_alone(continuous_run: Path):
+    months = ["generated/710000-00", "generated/710001-07"]
+
+    def returns(scenarios: list[str]) -> dict[str, float]:
+        agent = make_agent(continuous_run, top_k=4)
+        result = rl2grid.evaluate(agent, "bus14-R", scenarios=scenarios, episode_length=300, heuristic="idle")
+        return {each.scenario: each.episode_return for each in result.episodes}
+
+    assert returns(months) == returns(months[::-1])
+
+
+def test_of_continuous_actions_the_best_of_one_is_the_policy(continuous_run: Path):
+    env = gymnasium.make("rl2grid/bus14-R-v0", heuristic="idle")
+    policy, agent = load_agent(continuous_run), make_agent(continuous_run, top_k=1)
+    observation, info = env.reset(seed=5)
+    for each in (policy, agent):
+        each.bind(env)
+    np.testing.assert_array_equal(agent.act(observation, info), policy.act(observation, info))
+    env.close()
+
+
+def test_what_has_no_other_actions_to_compare_is_refused(run: Path, tmp_path: Path):
     with pytest.raises(UsageError, match="top_k=0 is not allowed: give a number of actions, at least 1"):
         make_agent(run, top_k=0)
     with pytest.raises(UsageError, match="leave it out for greedy"):
         make_agent("greedy", top_k=3)
-    with pytest.raises(UsageError, match="continuous actions has no best few"):  # before others have played
-        make_agent(trained(tmp_path / "run", "bus14-R"), top_k=2)
+    with pytest.raises(UsageError, match="TD3's policy draws no other actions"):  # before others have played
+        make_agent(trained(tmp_path / "run", "bus14-R", "td3"), top_k=2)

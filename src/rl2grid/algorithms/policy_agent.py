@@ -139,6 +139,20 @@ class PolicyAgent:
         chosen = values.masked_fill(~legal, -torch.inf).topk(min(k, int(legal.sum())))
         return [self._as_action(action) for action in chosen.indices.tolist()], chosen.values.tolist()
 
+    @property
+    def is_deterministic(self) -> bool:
+        """Whether there is nothing to draw: TD3's policy has one action for an observation, and no distribution."""
+        return not hasattr(self._network, "distribution")
+
+    def draws(self, observation: Observation, k: int, width: float) -> list[Action]:
+        """``k`` continuous actions, ``width`` times as far from the most probable one as its distribution draws."""
+        observations, masks = self._inputs(observation)
+        with torch.no_grad():
+            probable = self._network.act(observations, masks, None).clamp(-1.0, 1.0)
+            drawn = self._network.act(observations.expand(k, -1), masks, self._generator)
+        actions = (probable + width * (drawn - probable)).clamp(-1.0, 1.0)
+        return [self._as_action(action) for action in actions.numpy()]
+
     def _inputs(self, observation: Observation) -> tuple[torch.Tensor, torch.Tensor | None]:
         """An observation as the network reads it, and the actions that it may play, each with one row."""
         if self._normalizer is not None:

@@ -8,11 +8,13 @@ import gymnasium
 import numpy as np
 
 from rl2grid.agents.agent import Action, Considered, Info, Observation
-from rl2grid.agents.dispatch import worst_loading
 from rl2grid.algorithms.policy_agent import PolicyAgent
 from rl2grid.arrays import F64
 from rl2grid.errors import UsageError
 from rl2grid.mdp.heuristics import SAFE_RHO
+
+WIDTH = 3.0
+"""How much further away than a policy explores a better continuous action is looked for."""
 
 
 class TopK:
@@ -22,23 +24,28 @@ class TopK:
     loading is played. With ``k`` = 1 it is the policy. A topology task on the native engine asks one what-if for all
     ``k`` (:meth:`PowerGridEnv.what_if`), others one ``simulate`` each.
 
+    Continuous actions have no best few: the candidates are the most probable one and, where the forecast does not call
+    that safe, ``k`` - 1 around it, :data:`WIDTH` times as far away as the policy draws, from the stream of the episode
+    (:meth:`seed_episode`).
+
     Args:
-        policy: a policy with discrete actions, not bound yet.
+        policy: a policy, not bound yet.
         k: actions that are compared.
 
     Raises:
-        UsageError: ``k`` is below 1, or the policy's actions are continuous.
+        UsageError: ``k`` is below 1, or the policy's actions are continuous and it has no distribution of them.
     """
 
     def __init__(self, policy: PolicyAgent, k: int) -> None:
         if k < 1:
             raise UsageError(f"top_k={k} is not allowed: give a number of actions, at least 1.")
-        if policy.continuous:
-            raise UsageError("A policy with continuous actions has no best few of them: leave top_k out.")
+        if policy.continuous and policy.is_deterministic:
+            raise UsageError("TD3's policy draws no other actions to compare: leave top_k out.")
         self._policy, self._k = policy, k
         self.name = f"{policy.name}, best of {k}"
         self.task, self.env_keywords = policy.task, policy.env_keywords
         self.identity: dict[str, Any] = {**policy.identity, "top_k": k}
+        self._considered: Considered | None = None
 
     def bind(self, env: gymnasium.Env[Any, Any]) -> None:
         """Remember the environment, which is asked for forecasts.
@@ -55,8 +62,14 @@ class TopK:
         """Nothing to forget."""
         self._policy.reset(i)
 
+    def seed_episode(self, seed: int, episode: int) -> None:
+        """Draw from the stream (``seed``, ``episode``) from now on."""
+        self._policy.seed_episode(seed, episode)
+
     def act(self, observation: Observation, info: Info) -> Action:
         """The action to play."""
+        if self._policy.continuous:
+            return self._drawn(observation, info)
         candidates, preferences = self._policy.best(observation, self._k)
         loading = self._loading(candidates) if len(candidates) > 1 else np.zeros(1)
         safe = np.flatnonzero(loading < SAFE_RHO)
@@ -65,14 +78,38 @@ class TopK:
         return candidates[chosen]
 
     def explain(self) -> Considered | None:
-        """The candidates of the last decision by the policy's preference, and why one of them was played."""
+        """The candidates of the last decision by the policy's preference, of continuous ones by the worst loading by
+        the forecast, and why one of them was played.
+        """
         return self._considered
+
+    def _drawn(self, observation: Observation, info: Info) -> Action:
+        """The most probable continuous action if it is safe, else the best of what is drawn besides."""
+        candidates = [self._policy.act(observation, info)]
+        if self._k == 1:
+            self._considered = None
+            return candidates[0]
+        loading = self._loading(candidates)
+        if loading[0] >= SAFE_RHO:
+            drawn = self._policy.draws(observation, self._k - 1, WIDTH)
+            candidates, loading = candidates + drawn, np.concatenate((loading, self._loading(drawn)))
+        safe = np.flatnonzero(loading < SAFE_RHO)
+        chosen = int(safe[0]) if len(safe) else int(loading.argmin())
+        self._considered = Considered("worst loading", candidates, loading.tolist(), _why(chosen, len(safe) > 0))
+        return candidates[chosen]
 
     def _loading(self, candidates: list[Action]) -> F64:
         """The worst loading in the next step after each, by the forecast; infinite where the game would be lost."""
         if self._asks_at_once:
             return np.asarray(self._env.what_if(candidates).worst_loading, np.float64)
-        return np.array([worst_loading(self._env, action) for action in candidates])
+        return np.array([self._foreseen(action) for action in candidates])
+
+    def _foreseen(self, action: Action) -> float:
+        """The worst loading after an action; of one that would be refused nothing is foreseen, as of a lost game."""
+        result = self._env.simulate(action)
+        if result.terminated or result.info["illegal"]:
+            return np.inf
+        return float(result.observation[self._env.observation_slices["rho"]].max())
 
 
 def _why(chosen: int, is_safe: bool) -> str:
