@@ -30,6 +30,7 @@ def made_up_labels(task: Task | str, n: int, *, seed: int = 0, candidates: int =
         masks=masks if actions else None,
         topology=legal if actions else None,
         injection=generator.uniform(-1, 1, (n, continuous)).astype(np.float32) if continuous else None,
+        aim=generator.uniform(-5, 5, (n, continuous)).astype(np.float32) if continuous else None,
         candidates=np.tile(legal[:, None], (1, candidates)) if actions else np.full((n, candidates), -1, np.int64),
         values=generator.normal(size=(n, candidates)).astype(np.float32),
         weights=np.ones(n, np.float32),

@@ -1,19 +1,21 @@
 """The planner on all kinds of task: what it reaches, what it refuses, and that nothing but the seed decides."""
 
 from collections.abc import Collection
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
 import pytest
 
 import rl2grid  # noqa: F401  (registers the tasks)
-from rl2grid.agents.agent import no_intervention
+from rl2grid.agents.agent import injection_part, no_intervention
 from rl2grid.agents.planner import INGREDIENTS, Foretold, Planner
 from rl2grid.agents.trend import later_of, undispatched
 from rl2grid.engines.native.what_if import WhatIf, forecast_of, snapshot_of
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import AGENTS, kinds_of, make_agent
+from rl2grid.grids import load_grid
+from rl2grid.mdp.actions import continuous_layout
 
 DAYS = 2 * 288
 
@@ -112,6 +114,31 @@ def test_prevention_shifts_power_while_the_grid_is_safe():
     play(Planner(without=["prevention"]), other, steps=60)
     assert shifted > 10.0
     assert shifted > 2 * float(np.abs(other.unwrapped.state.actual_dispatch[0]).sum())
+
+
+class Telling(Planner):
+    """Asked after every action where it wants the injections."""
+
+    def act(self, observation: Any, info: Any) -> Any:
+        action = super().act(observation, info)
+        self.told.append((injection_part(action), self.aim()))
+        return action
+
+    told: ClassVar[list[Any]] = []
+
+
+@pytest.mark.parametrize("task", ["bus36-MO-v0-H0", "bus36-MO-v0-R"])
+def test_where_it_wants_injections_is_further_away_than_a_step_and_telling_changes_nothing(task: str):
+    telling, silent = Telling(), Planner()
+    played, expected = (play(agent, environment(task), seed=4, steps=80) for agent in (telling, silent))
+    for one, other in zip(played[0], expected[0], strict=True):
+        np.testing.assert_array_equal(injection_part(one), injection_part(other))
+    n_gen = len(continuous_layout(load_grid("bus36-MO-v0")).redispatch)
+    asked, aims = (np.array(each)[:, :n_gen] for each in zip(*telling.told, strict=True))
+    telling.told.clear()
+    assert np.abs(aims).max() > 2.0
+    assert np.abs(asked).max() <= 1.0
+    assert (np.sign(asked) * np.sign(aims) >= 0).mean() > 0.8, "it asks for something else than it wants"
 
 
 def test_power_is_shifted_before_announced_maintenance_where_nobody_attacks():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import json
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from rl2grid.envs.grid_env import PowerGridEnv
 from rl2grid.envs.tasks import find_task
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.crew import Job
+from rl2grid.mdp.actions import continuous_layout
 from rl2grid.records.labels import LABELS_FILE, Labels, is_labels, month_path, read_labels
 from rl2grid.scenarios.splits import TRAINING_SEEDS
 from rl2grid.training import teaching
@@ -73,6 +75,13 @@ class Overloaded:
 
     def overruled(self, played: Any) -> None:
         self.overruled_by.append(played)
+
+
+class FarAway(DoNothing):
+    """A teacher that wants every injection three steps away, and asks for nothing."""
+
+    def aim(self) -> Any:
+        return np.full(continuous_layout(find_task("bus14-R").grid).size, 3.0, np.float32)
 
 
 class AlwaysFirst(DoNothing):
@@ -143,6 +152,18 @@ def test_where_the_teacher_acts_every_state_is_kept(tmp_path: Path):
     assert labels.topology is not None
     assert (labels.topology > 0).mean() > 0.9
     assert (labels.weights[labels.topology > 0] == 1).all()
+
+
+def test_what_a_teacher_is_on_its_way_to_is_kept_beside_what_it_asks_for(tmp_path: Path):
+    labels = taught(tmp_path / "labels", FarAway(), "bus14-R", thin=1.0)
+    assert labels.injection is not None
+    assert labels.aim is not None
+    assert (labels.aim == 3.0).all()
+    assert (labels.injection == 0.0).all()
+    others = taught(tmp_path / "others", "dc-opf", "bus14-R", thin=1.0)
+    assert others.injection is not None
+    assert others.aim is not None
+    np.testing.assert_array_equal(others.aim, others.injection)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -285,6 +306,9 @@ def test_a_library_without_room_is_refused_before_anything_is_written(tmp_path: 
         ({"workers": -1}, "workers=-1 is not allowed"),
         ({"pupil": "random", "pupil_share": 0.0}, "pupil_share=0.0 is not allowed"),
         ({"pupil_share": 0.5}, "pupil_share=0.5 is of a pupil, and there is none"),
+        ({"pupil_top_k": 3}, "pupil_top_k is of a pupil that is given by name or path"),
+        ({"pupil": RandomAgent(), "pupil_top_k": 3}, "pupil_top_k is of a pupil that is given by name or path"),
+        ({"pupil": "random", "pupil_top_k": 3}, "leave it out for random"),
         ({"pupil": "nobody"}, "Agent 'nobody' does not exist"),
         ({"pupil": "random"}, "holds no labels yet"),
         ({"split": "test"}, "Labels of the test scenarios are refused"),
@@ -320,6 +344,17 @@ def test_other_labels_do_not_go_into_the_same_folder(tmp_path: Path):
     with pytest.raises(UsageError, match="different teacher"):
         teach("random", "bus14-T0", output=tmp_path / "labels", **SHORT)
     assert contents(tmp_path) == before
+
+
+def test_a_pupil_looks_before_it_acts_if_it_is_to(tmp_path: Path):
+    pupil = "pretrained/bus14-T0-idle"
+    for folder, changes in (("plain", {}), ("looking", {"pupil_top_k": 5})):
+        teach("greedy", "bus14-T0", output=tmp_path / folder, heuristic="idle", **SHORT)
+        teach("greedy", "bus14-T0", output=tmp_path / folder, pupil=pupil, **changes, **SHORT)
+    who = [json.loads((tmp_path / folder / LABELS_FILE).read_text())["rounds"][1] for folder in ("plain", "looking")]
+    assert [each["pupil"]["identity"].get("top_k") for each in who] == [None, 5]
+    assert "pupil_top_k=5" in who[1]["command"]
+    assert "pupil_top_k" not in who[0]["command"]
 
 
 def test_a_pupil_of_other_environments_is_refused(tmp_path: Path):

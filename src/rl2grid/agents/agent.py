@@ -89,6 +89,17 @@ class ExplainingAgent(Protocol):
 
 
 @runtime_checkable
+class AimingAgent(Protocol):
+    """An agent that knows where it wants the injections to be; who learns from it is told, beside what it asks for."""
+
+    def aim(self) -> NDArray[np.float32]:
+        """The continuous action that would bring them there at once, float32 [continuous].
+
+        Asked after ``act`` and before the next step; beyond [-1, 1] where that takes more than a step.
+        """
+
+
+@runtime_checkable
 class RankingAgent(Protocol):
     """An agent that compares single topology actions; who learns from it is told what it thought of them."""
 
@@ -144,6 +155,11 @@ def has_injections(space: gymnasium.Space[Any]) -> bool:
 def topology_part(action: Action) -> int:
     """The topology action in an action of a topology task or of a joint one."""
     return int(action[TOPOLOGY] if isinstance(action, Mapping) else action)
+
+
+def injection_part(action: Action) -> NDArray[np.float32]:
+    """The continuous action in an action of a redispatching task or of a joint one."""
+    return np.asarray(action[INJECTION] if isinstance(action, Mapping) else action, np.float32)
 
 
 def topology_action(space: gymnasium.Space[Any], chosen: int) -> Action:

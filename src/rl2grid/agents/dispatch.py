@@ -129,7 +129,13 @@ def requested_from(state: GridState, gens: NDArray[np.int32]) -> F64:
 
 
 def encode(state: GridState, grid: Grid, planned: F64) -> NDArray[np.float32]:
-    """The continuous action that asks for what :func:`optimal_injections` planned, float32 [continuous]."""
+    """The continuous action that asks for what was planned, as far as a step can, float32 [continuous]."""
+    action: NDArray[np.float32] = np.clip(encode_all(state, grid, planned), -1.0, 1.0)
+    return action
+
+
+def encode_all(state: GridState, grid: Grid, planned: F64) -> NDArray[np.float32]:
+    """What :func:`encode` clips: requests to generators beyond 1 are more than the ramp of a step."""
     layout = continuous_layout(grid)
     gens, renewables = layout.redispatch, layout.curtail
     dispatch, curtailed, delivered = np.split(planned, [len(gens), len(gens) + len(renewables)])
@@ -143,8 +149,8 @@ def encode(state: GridState, grid: Grid, planned: F64) -> NDArray[np.float32]:
     powers = np.divide(-delivered, most, out=np.zeros(len(delivered)), where=most > 0)
     moves[np.abs(request) < _NEGLIGIBLE] = 0.0
     powers[np.abs(delivered) < _NEGLIGIBLE] = 0.0
-    action: NDArray[np.float32] = np.clip(np.concatenate((moves, limits, powers)), -1.0, 1.0).astype(np.float32)
-    return action
+    within = np.clip(np.concatenate((limits, powers)), -1.0, 1.0)
+    return np.concatenate((moves, within)).astype(np.float32)
 
 
 def anything_dispatched(state: GridState) -> bool:

@@ -11,9 +11,9 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from rl2grid.agents.agent import Action, Considered, Info, Observation, injecting_action, topology_part
+from rl2grid.agents.agent import Action, Considered, Info, Observation, injecting_action, injection_part, topology_part
 from rl2grid.agents.contingencies import NONE, Contingencies, danger, expected, with_certain
-from rl2grid.agents.dispatch import controls, encode, worst_loading
+from rl2grid.agents.dispatch import controls, encode, encode_all, worst_loading
 from rl2grid.agents.greedy_topology import effects
 from rl2grid.agents.secure_dispatch import SecureDispatch, Series, with_change
 from rl2grid.agents.topology_search import NOTHING, SAFE, TopologySearch
@@ -48,6 +48,9 @@ _ENOUGH = 0.99
 """Worst loading that dispatch alone must leave for the topology to stay as it is."""
 _PERIOD = 6
 """Steps between plans while the grid is safe."""
+_AIM = 48
+"""Steps within which generators are to be where a pupil is told that they are wanted, while the grid is safe: so many
+that ramps hardly matter."""
 _LEAST_AGE = 2
 """Steps that a plan is followed at least, however the dispatch drifts."""
 _SHARES = (1.0, 0.5, 0.2)
@@ -168,10 +171,25 @@ class Planner:
         # A heuristic played between, or the environment was brought back to an earlier moment.
         self._is_plan_void |= not self._step <= step <= self._step + 1
         self._step = step
-        action = self._choose(self._moment(state))
+        moment = self._moment(state)
+        action = self._choose(moment)
         if self._search is not None:
             self._topology = topology_part(action)
+        self._last = moment, action
         return action
+
+    def aim(self) -> F32:
+        """Where it wants the injections: of a safe grid wherever ramps let them be in hours, else in the next step.
+
+        For the former a plan is made, besides the one that is followed for half an hour or for a step.
+        """
+        moment, action = self._last
+        if not moment.safe:
+            return injection_part(action)
+        assert moment.series is not None
+        topology = NOTHING if self._search is None else self._topology
+        planned = self._plan(moment, self._point(moment), topology, moment.series, _AIM)
+        return self._held() if planned is None else encode_all(moment.state, self._grid, planned)
 
     def forewarn(self, foretold: Foretold | None) -> None:
         """Dispatch against what is foretold, until it is there; None: against what is forecast and published alone."""
@@ -210,6 +228,10 @@ class Planner:
             return _Moment(state, safe, ahead, None, None)
         ahead = without_closing(state, ahead)
         return _Moment(state, safe, ahead, None, later_of(state, ahead, self._grid, self._change_per_step()))
+
+    def _point(self, moment: _Moment) -> Snapshot:
+        """What is expected in the next step; as it is now where the generators cannot follow."""
+        return moment.ahead if moment.ahead is not None else snapshot_of(self._env.engine, 0)
 
     def _is_calm(self, moment: _Moment) -> bool:
         """Whether nothing has to be done by the forecast."""
@@ -284,7 +306,7 @@ class Planner:
         assert self._dispatch is not None
         assert moment.series is not None
         state, series = moment.state, moment.series
-        point = moment.ahead if moment.ahead is not None else snapshot_of(self._env.engine, 0)
+        point = self._point(moment)
         pressed = self._dispatch.is_pressed(state, point, series)
         due = int(state.step[0]) % _PERIOD == 0 or topology != NOTHING or pressed or self._is_plan_void
         self._age += 1
@@ -302,7 +324,7 @@ class Planner:
 
     def _relieve(self, moment: _Moment) -> Action:
         """What makes the grid safe again."""
-        point = moment.ahead if moment.ahead is not None else snapshot_of(self._env.engine, 0)
+        point = self._point(moment)
         series = moment.series
         if self._search is None:
             assert series is not None

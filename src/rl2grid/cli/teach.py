@@ -33,6 +33,12 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         "--pupil-share", type=float, default=PUPIL_SHARE, help="probability with which the pupil acts, else the teacher"
     )
     parser.add_argument(
+        "--pupil-top-k",
+        type=int,
+        default=None,
+        help="actions of the pupil that the what-if compares when it acts; by default it plays its best",
+    )
+    parser.add_argument(
         "--gamma",
         type=float,
         default=None,
@@ -60,6 +66,7 @@ def _run(options: argparse.Namespace, output: Output) -> int:
         seed=options.seed,
         pupil=options.pupil,
         pupil_share=options.pupil_share,
+        pupil_top_k=options.pupil_top_k,
         gamma=options.gamma,
         thin=options.thin,
         workers=options.workers,
@@ -72,6 +79,7 @@ def _run(options: argparse.Namespace, output: Output) -> int:
             seed=options.seed,
             pupil=options.pupil,
             pupil_share=options.pupil_share,
+            pupil_top_k=options.pupil_top_k,
             gamma=options.gamma,
             thin=options.thin,
             output=options.output,

@@ -85,6 +85,9 @@ class Labels:
     """int64 [n], the teacher's topology action, which is legal; None on redispatching tasks."""
     injection: F32 | None
     """float32 [n, m], the teacher's continuous action in [-1, 1]; None on topology tasks."""
+    aim: F32 | None
+    """float32 [n, m], the continuous action that would bring injections at once where the teacher wants them: beyond
+    [-1, 1] where that takes more than a step, ``injection`` where it does not tell; None on topology tasks."""
     candidates: I64
     """int64 [n, k], legal topology actions that the teacher considered, best first; :data:`NO_CANDIDATE`: it considered
     fewer. k is 0 where a teacher never says any."""
@@ -126,7 +129,7 @@ class LabelShape(NamedTuple):
             columns["masks"] = np.dtype(np.uint8), (-(-self.n_topology_actions // 8),)
             columns["topology"] = i64, ()
         if self.n_injections:
-            columns["injection"] = f32, (self.n_injections,)
+            columns["injection"] = columns["aim"] = f32, (self.n_injections,)
         return columns | {
             "candidates": (i64, (self.n_candidates,)),
             "values": (f32, (self.n_candidates,)),
@@ -461,9 +464,10 @@ def _as_labels(arrays: Mapping[str, NDArray[Any]], shape: LabelShape) -> Labels:
 def _misfit(labels: Labels, shape: LabelShape) -> str | None:
     """What no teacher can have said, in words; None: nothing."""
     n_actions = shape.n_topology_actions
-    finite = {name: getattr(labels, name) for name in ("observations", "values", "rewards", "returns")}
+    told: list[NDArray[Any]] = [labels.observations, labels.values, labels.rewards, labels.returns]
+    told += [] if labels.aim is None else [labels.aim]
     checks: list[tuple[bool, str]] = [
-        (not all(bool(np.isfinite(each).all()) for each in finite.values()), "some of its numbers are not finite"),
+        (not all(bool(np.isfinite(each).all()) for each in told), "some of its numbers are not finite"),
         (not _within(labels.weights, 1.0, float(MAX_STEPS)), "a weight is below 1 or too large"),
         (not _within(labels.n_steps, 1, MAX_STEPS), "a transition has no steps, or too many"),
         (not _within(labels.ending, WENT_ON, COMPLETED), "a transition ended in no known way"),

@@ -61,6 +61,7 @@ def teach_command(
     gamma: float | None,
     thin: float,
     output: Path | None,
+    pupil_top_k: int | None = None,
 ) -> str:
     """The ``rl2grid teach`` that labels a round, or goes on with it, whatever is the default then.
 
@@ -72,6 +73,7 @@ def teach_command(
         seed: of the labels.
         pupil: who plays; None: the teacher.
         pupil_share: how often.
+        pupil_top_k: actions of it that are compared; None: it plays its best.
         gamma: the discount; None: the usual one.
         thin: one is kept of so many safe states in which nothing is done.
         output: the folder; None: the usual one.
@@ -79,6 +81,7 @@ def teach_command(
     words = ["rl2grid", "teach", teacher, short_id(task.id), "--months", str(months)]
     words += ["--seed", str(seed)] if seed else []
     words += [] if pupil is None else ["--pupil", str(pupil), "--pupil-share", f"{pupil_share:g}"]
+    words += [] if pupil_top_k is None else ["--pupil-top-k", str(pupil_top_k)]
     words += [] if gamma is None else ["--gamma", f"{gamma:g}"]
     words += ["--thin", f"{thin:g}"]
     words += ["--heuristic", str(keywords["heuristic"])] if "heuristic" in keywords else []

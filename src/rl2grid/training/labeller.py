@@ -11,6 +11,7 @@ import numpy as np
 from rl2grid.agents.agent import (
     Action,
     Agent,
+    AimingAgent,
     Considered,
     ExplainingAgent,
     Info,
@@ -20,6 +21,7 @@ from rl2grid.agents.agent import (
     RankingAgent,
     has_injections,
     has_topology_actions,
+    injection_part,
     intervenes,
     key_of,
     no_intervention,
@@ -30,7 +32,6 @@ from rl2grid.envs.description import step_action, task_catalogue
 from rl2grid.envs.tasks import Task
 from rl2grid.evaluation.reasons import explanation_of
 from rl2grid.handles import AsOpened
-from rl2grid.mdp.actions import INJECTION
 from rl2grid.mdp.heuristics import is_safe
 from rl2grid.mdp.state import GridState
 from rl2grid.records.labels import COMPLETED, GAME_OVER, NO_CANDIDATE, WENT_ON, Labels
@@ -47,6 +48,7 @@ class _Kept(NamedTuple):
     observation: F32
     mask: Flags | None
     action: Action
+    aim: F32 | None
     candidates: I64
     values: F32
     weight: float
@@ -137,14 +139,14 @@ class Labeller:
         ending = np.array([each.ending for each in self._transitions], np.int8)
         size, k = self._env.observation_space.shape[0], self._n_candidates
         topology = has_topology_actions(self._space)
-        parts = (
-            [np.asarray(_injection(each.action), np.float32) for each in kept] if has_injections(self._space) else []
-        )
+        injects, dimensions = has_injections(self._space), self._task.n_injections
+        injections = [injection_part(each.action) for each in kept] if injects else []
         return Labels(
             observations=_stacked([each.observation for each in kept], size, np.float32),
             masks=_stacked([each.mask for each in kept], self._task.n_topology_actions, np.bool_) if topology else None,
             topology=np.array([topology_part(each.action) for each in kept], np.int64) if topology else None,
-            injection=_stacked(parts, self._task.n_injections, np.float32) if has_injections(self._space) else None,
+            injection=_stacked(injections, dimensions, np.float32) if injects else None,
+            aim=_stacked([each.aim for each in kept], dimensions, np.float32) if injects else None,
             candidates=_stacked([each.candidates for each in kept], k, np.int64),
             values=_stacked([each.values for each in kept], k, np.float32),
             weights=np.array([each.weight for each in kept], np.float32),
@@ -169,7 +171,11 @@ class Labeller:
         mask = self._env.action_masks() if has_topology_actions(self._space) else None
         candidates, values = self._candidates(mask)
         place, seen = len(self._transitions), np.array(observation, np.float32)
-        self._kept.append(_Kept(place, seen, mask, action, candidates, values, weight, by_pupil))
+        aim = self._aim(action) if has_injections(self._space) else None
+        self._kept.append(_Kept(place, seen, mask, action, aim, candidates, values, weight, by_pupil))
+
+    def _aim(self, action: Action) -> F32:
+        return self._teacher.aim() if isinstance(self._teacher, AimingAgent) else injection_part(action)
 
     def _legal(self, action: Action) -> Action:
         """What the environment would play: of an illegal action nothing is kept, neither part.
@@ -231,10 +237,6 @@ def returns_of(rewards: F64, n_steps: I64, gamma: float) -> F64:
 def _is_less_better(values: Any) -> bool:
     """Whether of values, the best first, less is better."""
     return len(values) > 1 and bool(values[0] < values[-1])
-
-
-def _injection(action: Action) -> Any:
-    return action[INJECTION] if isinstance(action, dict) else action
 
 
 def _stacked(rows: list[Any], size: int, dtype: Any) -> Any:

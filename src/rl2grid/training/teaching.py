@@ -117,6 +117,7 @@ def teach(
     heuristic: str | None = AS_TRAINED,
     pupil: str | Path | Agent | None = None,
     pupil_share: float = PUPIL_SHARE,
+    pupil_top_k: int | None = None,
     gamma: float | None = None,
     thin: float = THIN,
     workers: int | None = None,
@@ -137,6 +138,7 @@ def teach(
         pupil: who acts while the teacher says what it would do (DAgger): the next round of a folder that has labels;
             None: the teacher acts.
         pupil_share: probability with which the pupil acts in a decision, else the teacher.
+        pupil_top_k: actions that the what-if compares when a pupil given by name or path acts; None: it plays its best.
         gamma: discount of a grid step in rewards and returns; None: :data:`DISCOUNTS`.
         thin: of so many decisions in which the grid is safe and the teacher does nothing, one is kept, at random.
         workers: processes that play at the same time; 0: this process plays; None: one per processor core, but this one
@@ -150,7 +152,9 @@ def teach(
     """
     task = find_task(task)
     chosen = make_agent(teacher, task) if isinstance(teacher, str | Path) else teacher
-    learner = make_agent(pupil, task) if isinstance(pupil, str | Path) else pupil
+    if pupil_top_k is not None and not isinstance(pupil, str | Path):
+        raise UsageError("pupil_top_k is of a pupil that is given by name or path: name it, or leave this out.")
+    learner = make_agent(pupil, task, top_k=pupil_top_k) if isinstance(pupil, str | Path) else pupil
     keywords = _keywords(task, chosen, learner, {**options, "heuristic": heuristic})
     gamma = DISCOUNTS[task.kind] if gamma is None else gamma
     _check_numbers(months, seed, pupil_share, gamma, thin, workers)
@@ -178,7 +182,7 @@ def teach(
     copy.deepcopy(setup).player().close()
     check_training_room(task.grid_id, months)
     watch_making(task.grid_id, *make_scenarios(task.grid_id, [_job(task, seed, 0, 0).scenario]), False)
-    call = command or _call(teacher, task, keywords, months, seed, pupil, pupil_share, gamma, thin, folder)
+    call = command or _call(teacher, task, keywords, months, seed, pupil, pupil_share, pupil_top_k, gamma, thin, folder)
     with open_labels(folder, _request(setup, seed), _round(setup, months, call)) as labels:
         named = all(isinstance(each, str | Path | None) for each in (teacher, pupil))
         rows = _label(setup, labels, seed, _number_of_workers(workers, named), progress)
@@ -341,6 +345,7 @@ def _call(
     seed: int,
     pupil: str | Path | Agent | None,
     pupil_share: float,
+    pupil_top_k: int | None,
     gamma: float,
     thin: float,
     folder: Path,
@@ -349,6 +354,8 @@ def _call(
     arguments |= changed_options(keywords)
     if pupil is not None:
         arguments |= {"pupil": _shown(pupil), "pupil_share": pupil_share}
+    if pupil_top_k is not None:
+        arguments["pupil_top_k"] = pupil_top_k
     words = ", ".join(f"{key}={value!r}" for key, value in arguments.items())
     return f"teach({_shown(teacher)!r}, {task.id!r}, {words}, output={str(folder)!r})"
 
