@@ -27,14 +27,17 @@ from rl2grid.algorithms.imitation import (
     huber,
     load_policy,
     preset,
+    said_by,
     weighted_statistics,
 )
 from rl2grid.algorithms.on_policy import ActorCritic
 from rl2grid.algorithms.registry import find_algorithm
 from rl2grid.algorithms.sac import CategoricalActor, GaussianActor
 from rl2grid.envs.normalization import ObservationNormalizer
+from rl2grid.envs.spec import task_spec
 from rl2grid.envs.tasks import find_task
 from rl2grid.errors import UsageError
+from rl2grid.mdp.actions import continuous_layout
 from rl2grid.records.labels import Labels
 
 SMALL: dict[str, Any] = {
@@ -92,6 +95,38 @@ def test_a_teacher_whose_action_is_a_function_of_the_observation_is_imitated(tmp
     assert metrics["charts/holdout_agreement"] > 0.9
     assert metrics["charts/holdout_agreement_acting"] > 0.9
     assert metrics["charts/epochs"] == pytest.approx(30_000 / (18 * 40))
+
+
+def of_loads(labels: Labels) -> Labels:
+    """The teacher wants the first unit where one feature says, many steps away, and asks for a whole ramp meanwhile."""
+    spec = task_spec(find_task("bus14-R"))
+    assert labels.injection is not None
+    assert spec.grid is not None
+    gens = continuous_layout(spec.grid).redispatch
+    observations = labels.observations.copy()
+    load = np.random.default_rng(int(1e6 * observations[0, 0] ** 2)).random(len(labels)).astype(np.float32)
+    observations[:, spec.feature("load_p").begin] = load
+    wanted = 0.4 * spec.grid.gen_pmax[gens[0]] * (load - 0.5)
+    ramp = np.where(wanted > 0.0, spec.grid.gen_max_ramp_up[gens[0]], spec.grid.gen_max_ramp_down[gens[0]])
+    aim = np.zeros_like(labels.injection)
+    aim[:, 0] = wanted / ramp
+    return replace(labels, observations=observations, injection=aim.clip(-1.0, 1.0), aim=aim)
+
+
+def test_a_network_of_set_points_learns_where_units_should_be(tmp_path: Path):
+    folder = write(tmp_path / "labels", "bus14-R", of_loads, months=20)
+    changes = {"network": "set-point", "normalize_observations": False, "huber_delta": 1.0}
+    imitation = learner(folder, "bus14-R", total_timesteps=30_000, **changes)
+    learned(imitation)
+    assert isinstance(imitation.network, ActorCritic)
+    batch = next(imitation.aside.batches(1000))
+    assert batch.aim is not None
+    assert float(batch.aim[:, 0].abs().max()) > 3.0
+    said = said_by(imitation.network, batch.observations)
+    assert said.aim is not None
+    error = (said.aim[:, 0] - batch.aim[:, 0]).abs().mean()
+    assert float(error.detach()) < 0.15 * float(batch.aim[:, 0].abs().mean())
+    assert float(said.outputs.abs().max()) <= 1.0
 
 
 @pytest.mark.parametrize("policy", ["ppo", "sac"])
@@ -194,6 +229,7 @@ def batch(**changes: Any) -> Batch:
         "masks": torch.tensor([[True, True, False], [True, True, True]]),
         "topology": torch.tensor([1, 2]),
         "injection": None,
+        "aim": None,
         "candidates": torch.tensor([[1, 0], [-1, -1]]),
         "values": torch.tensor([[0.3, 0.1], [0.0, 0.0]]),
         "stands_for": torch.ones(2),

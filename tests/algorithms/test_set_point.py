@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -13,7 +14,7 @@ from torch import Tensor, nn
 import rl2grid  # noqa: F401 - registers the tasks
 from rl2grid.algorithms.networks import PER_ACTION, VALUE, VALUE_OF_ACTION, NetworkFactory, Output, orthogonal
 from rl2grid.algorithms.networks.mlp import Layers
-from rl2grid.algorithms.networks.set_point import SetPoints
+from rl2grid.algorithms.networks.set_point import LEAST_SPREAD, SPREAD, USUAL, SetPoints, balanced
 from rl2grid.algorithms.registry import find_algorithm
 from rl2grid.envs.spec import Spec, task_spec
 from rl2grid.envs.tasks import find_task
@@ -55,8 +56,15 @@ def moved(spec: Spec, physical: Tensor, name: str, by: Tensor | float) -> Tensor
     return changed
 
 
+def evened(changes: Any) -> Any:
+    """The changes of one observation, the side that is more shortened to the other."""
+    up, down = changes[changes > 0].sum(), -changes[changes < 0].sum()
+    shares = np.where(changes > 0, min(1.0, down / max(up, 1e-9)), min(1.0, up / max(down, 1e-9)))
+    return changes * shares
+
+
 @pytest.mark.parametrize("task", ["bus14-R", "bus118-MOB-v0-R", "bus36-MO-v0-H1"])
-def test_means_are_what_is_missing_of_the_set_point_in_ramps(task: str):
+def test_means_are_what_a_step_can_do_of_what_is_missing_of_the_set_point(task: str):
     spec = spec_of_task(task)
     grid, network = spec.grid, made(spec)
     assert grid is not None
@@ -64,20 +72,40 @@ def test_means_are_what_is_missing_of_the_set_point_in_ramps(task: str):
     layout = continuous_layout(grid)
     gens, n_topology = layout.redispatch, spec.action_size - layout.size
     physical = observed(spec)
-    means = network(shown(spec, physical)).detach().numpy()
-    assert means.shape == (len(physical), spec.action_size)
-    target = physical[:, spec.feature("target_dispatch").begin :][:, gens].numpy()
-    points = network.layers((network.given(shown(spec, physical)) - 0.5) * 4.0).detach().numpy()
-    missing = points[:, : len(gens)] * grid.gen_pmax[gens] - target
-    ramps = np.where(missing > 0.0, grid.gen_max_ramp_up[gens], grid.gen_max_ramp_down[gens])
-    assert (missing > 0.0).any()
-    assert (missing < 0.0).any()
-    np.testing.assert_allclose(means[:, n_topology : n_topology + len(gens)], missing / ramps, rtol=1e-4, atol=1e-4)
-    np.testing.assert_allclose(means[:, n_topology + len(gens) :], points[:, len(gens) :], rtol=1e-6)
+    physical[:5, spec.feature("target_dispatch").begin : spec.feature("target_dispatch").end] = 0.0  # never asked
+    target, dispatch, up, down = (
+        physical[:, spec.feature(name).begin :][:, gens].numpy()
+        for name in ("target_dispatch", "actual_dispatch", "gen_margin_up", "gen_margin_down")
+    )
+    asked = np.where(target == 0.0, dispatch, target)
+    assert (asked[:5] == dispatch[:5]).all()
+
+    def requests(missing: Any) -> Any:
+        return missing / np.where(missing > 0.0, grid.gen_max_ramp_up[gens], grid.gen_max_ramp_down[gens])
+
+    points = network.layers((network.reads(shown(spec, physical)) - USUAL) / SPREAD).detach().numpy()
+    wanted, others = points[:, : len(gens)] * grid.gen_pmax[gens], points[:, len(gens) :]
+    changes = np.array([evened(row) for row in np.clip(wanted - dispatch, -down, up)])
+    np.testing.assert_allclose(changes.sum(axis=1), 0.0, atol=1e-3)
+    means = requests(dispatch + changes - asked).clip(-1.0, 1.0)
+    for outputs, expected in zip(
+        network.aims_and_means(shown(spec, physical)), (requests(wanted - asked), means), strict=True
+    ):
+        assert outputs.shape == (len(physical), spec.action_size)
+        injections = outputs.detach().numpy()[:, n_topology:]
+        np.testing.assert_allclose(injections[:, : len(gens)], expected, rtol=1e-3, atol=1e-3)
+        np.testing.assert_allclose(injections[:, len(gens) :], others, rtol=1e-6)
+    torch.testing.assert_close(network(shown(spec, physical)), network.aims_and_means(shown(spec, physical))[1])
+
+
+def test_balanced_changes_sum_to_zero_and_nothing_is_done_where_all_want_the_same():
+    changes = torch.tensor([[3.0, -1.0, 0.0], [3.0, 1.0, 0.0], [1.0, -2.0, -2.0], [0.0, 0.0, 0.0]])
+    expected = torch.tensor([[1.0, -1.0, 0.0], [0.0, 0.0, 0.0], [1.0, -0.5, -0.5], [0.0, 0.0, 0.0]])
+    torch.testing.assert_close(balanced(changes), expected)
 
 
 @pytest.mark.parametrize("task", ["bus14-R", "bus36-MO-v0-R"])
-def test_set_points_know_nothing_of_what_dispatch_has_moved(task: str):
+def test_set_points_do_not_see_the_dispatch(task: str):
     spec = spec_of_task(task)
     network, physical = made(spec), observed(spec)
     assert isinstance(network, SetPoints)
@@ -91,15 +119,37 @@ def test_set_points_know_nothing_of_what_dispatch_has_moved(task: str):
     changed = moved(spec, moved(spec, physical, "actual_dispatch", dispatch), "gen_p", dispatch)
     for name in ("gen_theta", "load_theta", "gen_margin_up", "gen_margin_down", "target_dispatch"):
         changed = moved(spec, changed, name, 3.0)
-    rho = spec.feature("rho")
-    changed[:, rho.begin : rho.end] *= 1.5
-    changed[:, spec.feature("loading_after_loss").begin] += 1.0
     torch.testing.assert_close(points(changed), points(physical), rtol=0.0, atol=1e-4)
-    for name in ("load_p", "gen_p", "time_before_cooldown_line", "attacked", "day_sine", "gen_p_before_curtail"):
+    for name in (
+        "load_p",
+        "gen_p",
+        "rho",
+        "loading_after_loss",
+        "time_before_cooldown_line",
+        "attacked",
+        "day_sine",
+        "gen_p_before_curtail",
+    ):
         assert not torch.allclose(points(moved(spec, physical, name, 1.0)), points(physical), atol=1e-4), name
-    out = physical.clone()
+    rho, out = spec.feature("rho"), physical.clone()
     out[:, rho.begin : rho.end] = 0.0
     assert not torch.allclose(points(out), points(physical))
+
+
+def test_what_is_read_is_standardised_by_what_was_learned_from():
+    spec = spec_of_task("bus36-MO-v0-R")
+    network, physical = made(spec), observed(spec, 50)
+    assert isinstance(network, SetPoints)
+    read = network.reads(shown(spec, physical)).double().numpy()
+    network.standardise(read.mean(axis=0), read.std(axis=0))
+    standard = (read - read.mean(axis=0)) / (read.std(axis=0) + LEAST_SPREAD)
+    points = network.layers(torch.from_numpy(standard).float())
+    again = made(spec)  # as from a checkpoint
+    again.load_state_dict(network.state_dict())
+    assert isinstance(again, SetPoints)
+    n = len(network.largest)
+    means = again(shown(spec, physical))
+    torch.testing.assert_close(means[:, n:], points[:, n:], rtol=1e-3, atol=1e-4)
 
 
 def test_maintenance_counts_more_the_nearer_it_is_and_not_at_all_where_none_is_planned():

@@ -13,9 +13,10 @@ Topology actions
     none) and the share e of smoothing (``label_smoothing``).
 
 Continuous actions
-    Means are fitted to a_k by Huber's loss. The deviations, which exploration starts with, are those of the teacher's
-    actions around the means: the log-likelihood of a Gaussian, whose means are not moved by it, within
-    ``log_std_range``. Of SAC's policy that is the Gaussian before it is squashed.
+    Means are fitted to a_k by Huber's loss; those of a network that says where injections should be (``set-point``)
+    before they are clipped to a step, to where the teacher wants them. The deviations, which exploration starts with,
+    are those of the teacher's actions around the means: the log-likelihood of a Gaussian, whose means are not moved by
+    it, within ``log_std_range``. Of SAC's policy that is the Gaussian before it is squashed.
 
 Joint tasks
     are learned as :class:`~rl2grid.envs.joint.JointAsBox`, whose topology action is that of the largest of the first n
@@ -57,6 +58,7 @@ from rl2grid.algorithms import on_policy, sac
 from rl2grid.algorithms.descent import Adam, descend
 from rl2grid.algorithms.diagnostics import explained_variance, mean
 from rl2grid.algorithms.hyperparameters import SharedArgs, changed_preset
+from rl2grid.algorithms.networks import Aiming
 from rl2grid.algorithms.on_policy import ActorCritic
 from rl2grid.algorithms.playing import check_environments
 from rl2grid.algorithms.registry import Algorithm
@@ -191,6 +193,8 @@ class Batch(NamedTuple):
     """int64, the teacher's"""
     injection: Tensor | None
     """float32, the teacher's"""
+    aim: Tensor | None
+    """float32, where it wants injections, see :class:`Labels`"""
     candidates: Tensor
     """int64 [batch, k], -1: none"""
     values: Tensor
@@ -217,6 +221,7 @@ class Examples:
             "observations": observations,
             "topology": None if labels.topology is None else torch.as_tensor(labels.topology, device=device),
             "injection": None if labels.injection is None else torch.as_tensor(labels.injection, device=device),
+            "aim": None if labels.aim is None else torch.as_tensor(labels.aim, device=device),
             "candidates": torch.as_tensor(labels.candidates, device=device),
             "values": torch.as_tensor(labels.values, device=device),
             "stands_for": torch.as_tensor(labels.weights, device=device),
@@ -347,11 +352,16 @@ class Said(NamedTuple):
     """continuous actions only: means of the Gaussian"""
     log_stds: Tensor | None = None
     """its log standard deviations, [dimensions] or [batch, dimensions]"""
+    aim: Tensor | None = None
+    """of networks that say where injections should be: the action that would bring them there at once"""
 
 
 def said_by(network: nn.Module, observations: Tensor) -> Said:
     """What any of the policies that are imitated with says of observations [batch, size]."""
     if isinstance(network, ActorCritic):
+        if isinstance(network.actor, Aiming):
+            aim, means = network.actor.aims_and_means(observations)
+            return Said(means, means, network.log_std, aim)
         outputs = network.actor(observations)
         return Said(outputs, outputs, network.log_std) if network.continuous else Said(outputs)
     if isinstance(network, GaussianActor):
@@ -394,7 +404,11 @@ def _continuous_errors(network: nn.Module, said: Said, batch: Batch, args: Args)
     assert said.log_stds is not None
     n = said.outputs.shape[-1] - batch.injection.shape[-1]
     played = said.outputs.clamp(-1.0, 1.0)
-    losses = huber(said.outputs[:, n:] - batch.injection, args.huber_delta)
+    if said.aim is None:
+        losses = huber(said.outputs[:, n:] - batch.injection, args.huber_delta)
+    else:
+        assert batch.aim is not None
+        losses = huber(said.aim[:, n:] - batch.aim, args.huber_delta)
     agrees = ((played[:, n:].detach() - batch.injection).abs() <= CLOSE).all(dim=-1)
     aimed_at = batch.injection
     if isinstance(network, GaussianActor):
@@ -487,6 +501,10 @@ class Imitation(Learner):
         self.aside = self._examples(kept, factor, scale)
         """What is held out."""
         self._order = -1, np.zeros(0, np.int64)
+        if isinstance(self.network, ActorCritic) and isinstance(self.network.actor, Aiming):
+            parts = [self.network.actor.reads(batch.observations).cpu() for batch in self.examples.batches(4096)]
+            seen = weighted_statistics(torch.cat(parts).numpy(), learned.weights)
+            self.network.actor.standardise(seen["mean"], np.sqrt(seen["squares"] / seen["count"]))
 
     def _examples(self, labels: Labels, factor: float, scale: float) -> Examples:
         acts = teacher_acts(labels)

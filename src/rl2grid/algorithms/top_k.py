@@ -78,24 +78,27 @@ class TopK:
         return candidates[chosen]
 
     def explain(self) -> Considered | None:
-        """The candidates of the last decision by the policy's preference, of continuous ones by the worst loading by
-        the forecast, and why one of them was played.
+        """What the last decision compared and why it was played: candidates by the policy's preference, continuous ones
+        by the worst loading by the forecast.
         """
         return self._considered
 
     def _drawn(self, observation: Observation, info: Info) -> Action:
-        """The most probable continuous action if it is safe, else the best of what is drawn besides."""
+        """The most probable continuous action if it is safe, else the first that is, or the best, of those drawn."""
         candidates = [self._policy.act(observation, info)]
         if self._k == 1:
-            self._considered = None
             return candidates[0]
-        loading = self._loading(candidates)
+        loading = [self._foreseen(candidates[0])]
         if loading[0] >= SAFE_RHO:
-            drawn = self._policy.draws(observation, self._k - 1, WIDTH)
-            candidates, loading = candidates + drawn, np.concatenate((loading, self._loading(drawn)))
-        safe = np.flatnonzero(loading < SAFE_RHO)
-        chosen = int(safe[0]) if len(safe) else int(loading.argmin())
-        self._considered = Considered("worst loading", candidates, loading.tolist(), _why(chosen, len(safe) > 0))
+            for action in self._policy.draws(observation, self._k - 1, WIDTH):
+                candidates.append(action)
+                loading.append(self._foreseen(action))
+                if loading[-1] < SAFE_RHO:
+                    break
+        order = np.argsort(loading, kind="stable").tolist()
+        chosen = order[0]
+        tried, values = [candidates[k] for k in order], [loading[k] for k in order]
+        self._considered = Considered("worst loading", tried, values, _why(chosen, loading[chosen] < SAFE_RHO))
         return candidates[chosen]
 
     def _loading(self, candidates: list[Action]) -> F64:

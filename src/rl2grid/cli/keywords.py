@@ -45,7 +45,11 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 def add_looking(parser: argparse.ArgumentParser, others: str = "") -> None:
     """Add the flags that say how a policy looks before it acts; ``others`` follows their help."""
     for name, metavar, text in (
-        ("top-k", "K", "of policies: the what-if chooses of their K best actions; by default they play the best"),
+        (
+            "top-k",
+            "K",
+            "of policies: the what-if chooses of K, their best actions or, of continuous ones, around the best",
+        ),
         ("rehearse", "STEPS", "of policies: so much of a crisis, 24 for instance, is played in imagined worlds first"),
     ):
         parser.add_argument(f"--{name}", type=int, default=None, metavar=metavar, help=text + others)

@@ -17,13 +17,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any, Self
+from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from rl2grid.arrays import I64
+from rl2grid.arrays import F64, I64
 from rl2grid.dense.choices import NEVER
 from rl2grid.envs.spec import JointActions, Spec, spec_from_state
 from rl2grid.errors import UsageError, one_of
@@ -140,6 +140,22 @@ class Network:
     from them may not."""
     needs_grid: bool = False
     """Whether it is for tasks of rl2grid alone, whose ``Spec`` has a grid."""
+
+
+@runtime_checkable
+class Aiming(Protocol):
+    """A module whose means are the way to where injections should be: what a pupil is told of that is learned."""
+
+    def aims_and_means(self, observations: Tensor) -> tuple[Tensor, Tensor]:
+        """The action that would bring them there at once, and as much of that as a step can do, each
+        [batch, action_size]; the latter are its means.
+        """
+
+    def reads(self, observations: Tensor) -> Tensor:
+        """What it reads of observations, [batch, ...]."""
+
+    def standardise(self, means: F64, deviations: F64) -> None:
+        """Take off the means of what it reads, [...], and divide by its deviations."""
 
 
 _IN_PACKAGE = {

@@ -1,18 +1,26 @@
 """Where generators should be, in place of how they should move: means of continuous actions.
 
 What a teacher asks of a generator in a step depends on how far it has moved it before, and an error of the pupil stays
-in that for good. Where it wants the generator to be does not: that follows from schedules, demand and outages. So what
-sees nothing of what dispatch has moved says where every redispatchable generator should be, x_g MW beside its schedule,
-and the mean of its entry is what is missing of that,
+in that for good. Where it wants the generator to be does not: that follows from schedules, demand, outages, and from
+how lines are loaded. So what does not see the dispatch says where every redispatchable generator should be, x_g MW
+beside its schedule, and the mean of its entry is what a step can do of that,
 
-    a_g = (x_g - target_g) / ramp_g                              ramp_g upwards or downwards, as the sign asks
+    change_g = clip(x_g - dispatch_g, - margin_g downwards, margin_g upwards)        then balanced, see below
+    a_g      = (dispatch_g + change_g - asked_g) / ramp_g                            clipped into [-1, 1]
 
-which the environment clips to the ramp of a step. What the layers say of curtailment and storage are the means of those
-entries. The topology entries of a joint task, and values, have layers of their own, over the whole observation.
+Margins are what ramps and limits leave; ramps are those upwards or downwards, as the sign asks. asked_g is what a
+request is added to: the target, or the dispatch of who was never asked. Those that go up, or those that go down,
+whichever would be more, wait for the others, so that all changes sum to zero: else what is asked for is often more
+than the others can make up for, which the environment refuses.
 
-What dispatch has moved are flows, angles, margins, and the generators' power, of which the schedule is left when the
-dispatch is taken off. Inputs are observations as the environment gives them, in units of
-:mod:`rl2grid.mdp.features`, from which a half is taken before they are multiplied by four.
+What is learned by imitation is x_g, before it is clipped. What the layers say of curtailment and storage are the means
+of those entries. The topology entries of a joint task, and values, have layers of their own, over the whole
+observation.
+
+Inputs are observations as the environment gives them, in units of :mod:`rl2grid.mdp.features`. Of what is read of them
+a half is taken before it is multiplied by four; by imitation the mean of what is learned from, before it is divided by
+the deviation of that, so that what is rare, a line that is out, counts as much as what is not. The checkpoint holds
+both numbers.
 """
 
 from __future__ import annotations
@@ -24,7 +32,7 @@ from torch import Tensor, nn
 from rl2grid.algorithms.networks import PER_ACTION, Network, Request
 from rl2grid.algorithms.networks.constants import URGENT_STEPS, keep, urgency
 from rl2grid.algorithms.networks.mlp import Layers, build, stacked
-from rl2grid.arrays import I64
+from rl2grid.arrays import F64, I32, I64
 from rl2grid.envs.spec import JointActions, Spec
 from rl2grid.envs.tasks import find_task
 from rl2grid.errors import UsageError
@@ -34,14 +42,20 @@ from rl2grid.mdp.features import OPERATOR_FEATURES, physical_scale
 NAME = "set-point"
 GIVEN = (
     "t", "load_p", "time_before_cooldown_line", "topo_vect", "line_status",
-    "time_before_cooldown_sub", "gen_p_before_curtail", "duration_next_maintenance", "storage_charge",
-    *OPERATOR_FEATURES["calendar"], *OPERATOR_FEATURES["attacks"],
+    "time_before_cooldown_sub", "gen_p_before_curtail", "duration_next_maintenance", "storage_charge", "rho",
+    *OPERATOR_FEATURES["calendar"], *OPERATOR_FEATURES["attacks"], *OPERATOR_FEATURES["security"],
 )  # fmt: skip
 """Features that are read as they are."""
+USUAL, SPREAD = 0.5, 0.25
+"""Mean and deviation of what is read, before anything was seen."""
+_TRIFLE = 1e-6
+"""MW."""
+LEAST_SPREAD = 0.01
+"""What is added to deviations that were seen: what hardly changes is not magnified without bounds."""
 
 
 class Given(nn.Module):
-    """What of an observation no dispatch has moved."""
+    """What of an observation tells where generators should be, but not where they are."""
 
     def __init__(self, spec: Spec) -> None:
         super().__init__()
@@ -79,47 +93,95 @@ def _entries(slices: dict[str, slice]) -> I64:
     return np.concatenate([np.arange(slices[name].start, slices[name].stop) for name in GIVEN if name in slices])
 
 
+class Dispatched(nn.Module):
+    """What an observation says of the redispatchable generators, in MW, each [batch, generator]."""
+
+    def __init__(self, spec: Spec, gens: I32) -> None:
+        super().__init__()
+        assert spec.grid is not None
+        assert spec.shift is not None
+        assert spec.scale is not None
+        names = ("target_dispatch", "actual_dispatch", "gen_margin_up", "gen_margin_down")
+        entries = np.concatenate([spec.feature(name).begin + gens for name in names]).astype(np.int64)
+        keep(
+            self,
+            entries=torch.from_numpy(entries),
+            shift=torch.tensor(spec.shift[entries]),
+            scale=torch.tensor(spec.scale[entries]),
+            ramp_up=torch.tensor(spec.grid.gen_max_ramp_up[gens]),
+            ramp_down=torch.tensor(spec.grid.gen_max_ramp_down[gens]),
+        )
+
+    entries: Tensor
+    shift: Tensor
+    scale: Tensor
+    ramp_up: Tensor
+    ramp_down: Tensor
+
+    def forward(self, observations: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """What requests are added to, the dispatch, and what it may change by upwards and downwards."""
+        values = observations[:, self.entries] * self.scale + self.shift
+        target, dispatch, up, down = values.chunk(4, dim=1)
+        return torch.where(target == 0.0, dispatch, target), dispatch, up, down
+
+    def requests(self, missing: Tensor) -> Tensor:
+        """MW that are missing, in ramps."""
+        return missing / torch.where(missing > 0.0, self.ramp_up, self.ramp_down)
+
+
+def balanced(changes: Tensor) -> Tensor:
+    """Changes [batch, generator], upwards or downwards shortened alike so that they sum to zero."""
+    up, down = changes.clamp(min=0.0), changes.clamp(max=0.0)
+    ups, downs = up.sum(dim=1, keepdim=True), -down.sum(dim=1, keepdim=True)
+    both = torch.minimum(ups, downs)
+    return up * (both / ups.clamp(min=_TRIFLE)) + down * (both / downs.clamp(min=_TRIFLE))
+
+
 class SetPoints(nn.Module):
     """Means of injections (module docstring), after those of topology entries if there are such."""
 
     def __init__(self, request: Request, layout: ContinuousLayout, n_topology: int) -> None:
         super().__init__()
         spec, draws = request.spec, (request.style, request.generator)
-        grid, gens = spec.grid, layout.redispatch
-        assert grid is not None
-        assert spec.shift is not None
-        assert spec.scale is not None
-        self.given = Given(spec)
+        assert spec.grid is not None
+        self.given, self.dispatched = Given(spec), Dispatched(spec, layout.redispatch)
         self.layers = stacked((self.given.size, *request.layers, layout.size), *draws)
         self.topology: Layers | None = None
         if n_topology:
             self.topology = stacked((spec.observation_size, *request.layers, n_topology), *draws)
-        target = spec.feature("target_dispatch").begin + gens
-        keep(
-            self,
-            targets=torch.from_numpy(target.astype(np.int64)),
-            shift=torch.tensor(spec.shift[target]),
-            scale=torch.tensor(spec.scale[target]),
-            largest=torch.tensor(grid.gen_pmax[gens]),
-            ramp_up=torch.tensor(grid.gen_max_ramp_up[gens]),
-            ramp_down=torch.tensor(grid.gen_max_ramp_down[gens]),
-        )
+        self.register_buffer("usual", torch.full((self.given.size,), USUAL))
+        self.register_buffer("spread", torch.full((self.given.size,), SPREAD))
+        keep(self, largest=torch.tensor(spec.grid.gen_pmax[layout.redispatch]))
 
-    targets: Tensor
-    shift: Tensor
-    scale: Tensor
+    usual: Tensor
+    spread: Tensor
     largest: Tensor
-    ramp_up: Tensor
-    ramp_down: Tensor
+
+    def reads(self, observations: Tensor) -> Tensor:
+        """What is read of observations [batch, observation_size], before it is standardised, [batch, ...]."""
+        read: Tensor = self.given(observations)
+        return read
+
+    def standardise(self, means: F64, deviations: F64) -> None:
+        """Read everything by how it differs from what is usual; both [...] as :meth:`reads` has it."""
+        self.usual.copy_(torch.from_numpy(means))
+        self.spread.copy_(torch.from_numpy(deviations + LEAST_SPREAD))
 
     def forward(self, observations: Tensor) -> Tensor:
-        """Observations [batch, observation_size] -> means [batch, action_size], not clipped."""
-        said = self.layers((self.given(observations) - 0.5) * 4.0)
-        n = len(self.targets)
-        missing = said[:, :n] * self.largest - (observations[:, self.targets] * self.scale + self.shift)
-        moves = missing / torch.where(missing > 0.0, self.ramp_up, self.ramp_down)
+        """Observations [batch, observation_size] -> means [batch, action_size]."""
+        return self.aims_and_means(observations)[1]
+
+    def aims_and_means(self, observations: Tensor) -> tuple[Tensor, Tensor]:
+        """The action that would bring all generators there at once, and what a step can do, [batch, action_size]."""
+        said = self.layers((self.given(observations) - self.usual) / self.spread)
+        n = len(self.largest)
+        wanted, others = said[:, :n] * self.largest, said[:, n:]
+        asked, dispatch, up, down = self.dispatched(observations)
+        changes = balanced(torch.minimum(torch.maximum(wanted - dispatch, -down), up))
+        aims = self.dispatched.requests(wanted - asked)
+        means = self.dispatched.requests(dispatch + changes - asked).clamp(-1.0, 1.0)
         topology = [] if self.topology is None else [self.topology(observations)]
-        return torch.cat([*topology, moves, said[:, n:]], dim=1)
+        return torch.cat([*topology, aims, others], dim=1), torch.cat([*topology, means, others], dim=1)
 
 
 def make(request: Request) -> nn.Module:
