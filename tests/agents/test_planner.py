@@ -1,7 +1,7 @@
 """The planner on all kinds of task: what it reaches, what it refuses, and that nothing but the seed decides."""
 
 from collections.abc import Collection
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -119,12 +119,14 @@ def test_prevention_shifts_power_while_the_grid_is_safe():
 class Telling(Planner):
     """Asked after every action where it wants the injections."""
 
+    def __init__(self) -> None:
+        super().__init__()
+        self.told: list[Any] = []
+
     def act(self, observation: Any, info: Any) -> Any:
         action = super().act(observation, info)
         self.told.append((injection_part(action), self.aim()))
         return action
-
-    told: ClassVar[list[Any]] = []
 
 
 @pytest.mark.parametrize("task", ["bus36-MO-v0-H0", "bus36-MO-v0-R"])
@@ -135,7 +137,6 @@ def test_where_it_wants_injections_is_further_away_than_a_step_and_telling_chang
         np.testing.assert_array_equal(injection_part(one), injection_part(other))
     n_gen = len(continuous_layout(load_grid("bus36-MO-v0")).redispatch)
     asked, aims = (np.array(each)[:, :n_gen] for each in zip(*telling.told, strict=True))
-    telling.told.clear()
     assert np.abs(aims).max() > 2.0
     assert np.abs(asked).max() <= 1.0
     assert (np.sign(asked) * np.sign(aims) >= 0).mean() > 0.8, "it asks for something else than it wants"

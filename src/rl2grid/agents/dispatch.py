@@ -169,5 +169,9 @@ def control_positions(grid: Grid) -> NDArray[np.int32]:
 
 def worst_loading(env: Any, action: Action) -> float:
     """The largest loading that :meth:`PowerGridEnv.simulate` foresees; infinite where the game would be lost."""
-    result = env.simulate(action)
+    return loading_of(env, env.simulate(action))
+
+
+def loading_of(env: Any, result: Any) -> float:
+    """The largest loading in what :meth:`PowerGridEnv.simulate` returned; infinite where the game would be lost."""
     return np.inf if result.terminated else float(result.observation[env.observation_slices["rho"]].max())

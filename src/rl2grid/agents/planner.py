@@ -187,8 +187,7 @@ class Planner:
         if not moment.safe:
             return injection_part(action)
         assert moment.series is not None
-        topology = NOTHING if self._search is None else self._topology
-        planned = self._plan(moment, self._point(moment), topology, moment.series, _AIM)
+        planned = self._plan(moment, self._point(moment), self._topology, moment.series, _AIM)
         return self._held() if planned is None else encode_all(moment.state, self._grid, planned)
 
     def forewarn(self, foretold: Foretold | None) -> None:

@@ -8,6 +8,7 @@ import gymnasium
 import numpy as np
 
 from rl2grid.agents.agent import Action, Considered, Info, Observation
+from rl2grid.agents.dispatch import loading_of
 from rl2grid.algorithms.policy_agent import PolicyAgent
 from rl2grid.arrays import F64
 from rl2grid.errors import UsageError
@@ -110,9 +111,7 @@ class TopK:
     def _foreseen(self, action: Action) -> float:
         """The worst loading after an action; of one that would be refused nothing is foreseen, as of a lost game."""
         result = self._env.simulate(action)
-        if result.terminated or result.info["illegal"]:
-            return np.inf
-        return float(result.observation[self._env.observation_slices["rho"]].max())
+        return np.inf if result.info["illegal"] else loading_of(self._env, result)
 
 
 def _why(chosen: int, is_safe: bool) -> str:

@@ -48,10 +48,10 @@ GIVEN = (
 """Features that are read as they are."""
 USUAL, SPREAD = 0.5, 0.25
 """Mean and deviation of what is read, before anything was seen."""
-_TRIFLE = 1e-6
-"""MW."""
 LEAST_SPREAD = 0.01
 """What is added to deviations that were seen: what hardly changes is not magnified without bounds."""
+_TRIFLE = 1e-6
+"""MW that nobody waits for."""
 
 
 class Given(nn.Module):
