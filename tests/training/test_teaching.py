@@ -186,6 +186,20 @@ def test_an_illegal_decision_is_labelled_as_what_is_played(tmp_path: Path, monke
     assert (labels.topology == 0).all()
 
 
+def test_of_an_illegal_joint_decision_no_aim_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    class FarAndFirst(FarAway):
+        def act(self, observation: Any, info: Any) -> Any:
+            return {"topology": 1, "injection": np.zeros(6, np.float32)}
+
+    legal = taught(tmp_path / "legal", FarAndFirst(), "bus14-H0", thin=1.0, months=1)
+    assert legal.aim is not None
+    assert (legal.aim == 3.0).all()
+    monkeypatch.setattr(PowerGridEnv, "action_masks", lambda self: np.arange(50) != 1)
+    illegal = taught(tmp_path / "illegal", FarAndFirst(), "bus14-H0", thin=1.0, months=1)
+    assert illegal.aim is not None
+    assert (illegal.aim == 0.0).all()
+
+
 @pytest.mark.parametrize("task", ["bus14-T0", "bus14-H0"])
 def test_a_pupil_acts_and_the_teacher_says_what_it_would_do(tmp_path: Path, task: str):
     alone = taught(tmp_path / "labels", Overloaded(), task, thin=1.0)

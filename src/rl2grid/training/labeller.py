@@ -116,13 +116,15 @@ class Labeller:
 
     def act(self, observation: Observation, info: Info) -> Action:
         """What is played: the teacher's action, or the pupil's."""
-        action = self._legal(self._teacher.act(observation, info))
+        chosen = self._teacher.act(observation, info)
+        action = self._legal(chosen)
         acts, by_pupil = intervenes(action), self._pupil_acts()
         self.acted += acts
         asks_for_something = acts or not is_safe(self._opened(self._env.state), 0)
         drawn = bool(self._thinning.uniform(1)[0] * self._thin < 1.0)
         if asks_for_something or drawn:
-            self._keep(observation, action, 1.0 if asks_for_something else self._thin, by_pupil)
+            aim = self._aim(action, chosen) if has_injections(self._space) else None
+            self._keep(observation, action, aim, 1.0 if asks_for_something else self._thin, by_pupil)
         return self._played_by_pupil(action, observation, info) if by_pupil else action
 
     def note(self, lost: bool, completed: bool, info: Info) -> None:
@@ -167,15 +169,17 @@ class Labeller:
             self._teacher.overruled(played)
         return played
 
-    def _keep(self, observation: Observation, action: Action, weight: float, by_pupil: bool) -> None:
+    def _keep(self, observation: Observation, action: Action, aim: F32 | None, weight: float, by_pupil: bool) -> None:
         mask = self._env.action_masks() if has_topology_actions(self._space) else None
         candidates, values = self._candidates(mask)
         place, seen = len(self._transitions), np.array(observation, np.float32)
-        aim = self._aim(action) if has_injections(self._space) else None
         self._kept.append(_Kept(place, seen, mask, action, aim, candidates, values, weight, by_pupil))
 
-    def _aim(self, action: Action) -> F32:
-        return self._teacher.aim() if isinstance(self._teacher, AimingAgent) else injection_part(action)
+    def _aim(self, action: Action, chosen: Action) -> F32:
+        """Where the teacher wants injections; of an illegal action, for which nothing was played, nowhere else."""
+        if action is chosen and isinstance(self._teacher, AimingAgent):
+            return self._teacher.aim()
+        return injection_part(action)
 
     def _legal(self, action: Action) -> Action:
         """What the environment would play: of an illegal action nothing is kept, neither part.
