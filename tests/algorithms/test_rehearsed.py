@@ -10,6 +10,7 @@ import pytest
 
 import rl2grid
 from rl2grid.agents.rehearsal import Rehearsal
+from rl2grid.algorithms.policy_agent import PolicyAgent, load_agent
 from rl2grid.algorithms.rehearsed import Rehearsed
 from rl2grid.envs.registration import register_all
 from rl2grid.errors import UsageError
@@ -19,6 +20,7 @@ from rl2grid.mdp.heuristics import is_safe
 
 POLICY = "pretrained/bus14-T0-idle"
 MONTH = "generated/710004-04"
+INJECTING, LOST_ALONE = "pretrained/bus118-M-R", "generated/710005-11"
 
 
 def survived(agent: Any, heuristic: str | None) -> Episode:
@@ -60,6 +62,27 @@ def test_it_does_with_a_policy_what_rehearsal_does_with_a_guide():
     assert (one.grid_steps, one.episode_return) == (other.grid_steps, other.episode_return)
 
 
+def drawing_nothing(folder: Path) -> PolicyAgent:
+    """A policy of TD3 that has learned nothing."""
+    changes = {"total_timesteps": 64, "num_envs": 4, "num_steps": 16, "actor_layers": (4,), "critic_layers": (4,)}
+    run = rl2grid.train("td3", "bus14-R", hyperparameters=changes, folder=folder / "run", validation_months=0)
+    return load_agent(run)
+
+
+def test_of_a_redispatching_policy_injections_are_rehearsed():
+    register_all()
+    policy, rehearsing = make_agent(INJECTING), make_agent(INJECTING, rehearse=24)
+    env: Any = gymnasium.make("rl2grid/bus118-M-R-v0", split="validation", **policy.env_keywords)  # type: ignore[attr-defined]
+    for agent in (policy, rehearsing):
+        agent.bind(env)
+    alone = play_episode(policy, env, scenario=LOST_ALONE, seed=0)
+    rehearsed, again = (play_episode(rehearsing, env, scenario=LOST_ALONE, seed=0) for _ in range(2))
+    assert alone.survival < 1.0
+    assert rehearsed.survival == 1.0
+    assert rehearsed.foresight == 0
+    assert again.episode_return == rehearsed.episode_return, "what is drawn does not depend on what was played before"
+
+
 def test_it_is_named_identified_and_made_by_its_run():
     agent, policy = make_agent(POLICY, top_k=3, rehearse=12), make_agent(POLICY)
     assert isinstance(agent, Rehearsed)
@@ -75,5 +98,5 @@ def test_what_has_no_crisis_to_rehearse_is_refused(tmp_path: Path):
         make_agent(POLICY, rehearse=0)
     with pytest.raises(UsageError, match="leave it out for greedy"):
         make_agent("greedy", rehearse=24)
-    with pytest.raises(UsageError, match="bus118-M-R-v0 has no topology actions to rehearse"):
-        make_agent("pretrained/bus118-M-R", rehearse=24)
+    with pytest.raises(UsageError, match="TD3's policy draws no other actions to rehearse"):
+        Rehearsed(drawing_nothing(tmp_path), 24)

@@ -11,7 +11,7 @@ import pytest
 
 import rl2grid
 from rl2grid.algorithms.policy_agent import PolicyAgent, load_agent
-from rl2grid.algorithms.top_k import WIDTH, TopK
+from rl2grid.algorithms.top_k import TopK
 from rl2grid.envs.registration import register_all
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import make_agent
@@ -131,7 +131,7 @@ def test_continuous_actions_are_drawn_where_the_most_probable_one_is_not_safe(co
             candidates = [first]
             loading = [foreseen(env, first)]
             if loading[0] >= SAFE_RHO:
-                candidates += policy.draws(observation, 5, WIDTH)
+                candidates += policy.draws(observation, 5)
                 loading += [foreseen(env, each) for each in candidates[1:]]
             safe = [k for k, each in enumerate(loading) if each < SAFE_RHO]
             expected = safe[0] if safe else int(np.argmin(loading))

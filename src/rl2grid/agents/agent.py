@@ -100,6 +100,14 @@ class AimingAgent(Protocol):
 
 
 @runtime_checkable
+class ProposingAgent(Protocol):
+    """An agent that says which other continuous actions it would try, of which there are no best few to name."""
+
+    def proposals(self, observation: Observation, info: Info) -> list[Action]:
+        """What it would play without looking, and others around it."""
+
+
+@runtime_checkable
 class RankingAgent(Protocol):
     """An agent that compares single topology actions; who learns from it is told what it thought of them."""
 

@@ -11,7 +11,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rl2grid.agents.agent import Action, Agent, topology_part
+from rl2grid.agents.agent import (
+    Action,
+    Agent,
+    Info,
+    Observation,
+    ProposingAgent,
+    key_of,
+    no_intervention,
+    topology_part,
+)
+from rl2grid.agents.dispatch import loading_of
 from rl2grid.agents.planner import Planner
 from rl2grid.engines.worlds import World
 from rl2grid.errors import UsageError
@@ -114,7 +124,8 @@ class Courses:
 
     Args:
         env: the environment that is copied.
-        guide: who plays on, from any state and whatever was played before; it is bound to the copy.
+        guide: who plays on, from any state and whatever was played before; it is bound to the copy. In a redispatching
+            task it proposes what else is tried.
         candidates: other actions that are tried per decision: the best ones by the worst loading in the next step.
     """
 
@@ -184,7 +195,7 @@ class Courses:
         return self.play(world, () if attempt.action is None else (attempt.action,), until=until)
 
     def attempts_at(self, decisions: Sequence[Decision]) -> Iterator[Attempt]:
-        """What is tried: other topology actions, the last decisions first."""
+        """What is tried: other topology actions, in a redispatching task injections, the last decisions first."""
         crisis = begin_of_crisis(decisions)
         remedies = self._best_at(decisions[crisis].world)
         for at in range(len(decisions) - 1, crisis - 1, -1):
@@ -192,13 +203,23 @@ class Courses:
         for at in (crisis - earlier for earlier in EARLIER if earlier <= crisis):
             yield from _others(decisions[: at + 1], remedies)
 
-    def _best_at(self, world: World) -> list[int]:
-        """Nothing, and the topology actions with the least worst loading in the next step."""
-        self._env.restore(world)
+    def _best_at(self, world: World) -> list[Action]:
+        """Nothing, and the actions with the least worst loading in the next step; of topology all are compared."""
+        observation, info = self._env.restore(world)
+        if not self._env.task.changes_topology:
+            return self._best_proposed(observation, info)
         outcomes = self._env.what_if()
         loading = np.where(outcomes.legal, outcomes.worst_loading, np.inf)
         best = np.argsort(loading, kind="stable")[: self._candidates]
         return [int(action) for action in dict.fromkeys([*best[np.isfinite(loading[best])].tolist(), 0])]
+
+    def _best_proposed(self, observation: Observation, info: Info) -> list[Action]:
+        assert isinstance(self._guide, ProposingAgent)
+        proposed = self._guide.proposals(observation, info)
+        results = [self._env.simulate(action) for action in proposed]
+        loading = np.array([np.inf if each.info["illegal"] else loading_of(self._env, each) for each in results])
+        best = np.argsort(loading, kind="stable")[: self._candidates]
+        return [*(proposed[k] for k in best if np.isfinite(loading[k])), no_intervention(self._env.action_space)]
 
 
 def begin_of_crisis(decisions: Sequence[Decision]) -> int:
@@ -209,11 +230,14 @@ def begin_of_crisis(decisions: Sequence[Decision]) -> int:
     return crisis
 
 
-def _others(decisions: Sequence[Decision], topologies: Iterable[int]) -> Iterator[Attempt]:
-    """The last decision with other topology actions; what it injects in a joint task stays."""
+def _others(decisions: Sequence[Decision], actions: Iterable[Action]) -> Iterator[Attempt]:
+    """The last decision with other actions; what it injects in a joint task stays."""
     played = decisions[-1].action
-    others = (topology for topology in topologies if topology != topology_part(played))
-    return (Attempt(decisions, _with_topology(played, topology)) for topology in others)
+    if isinstance(played, np.ndarray):
+        others = (action for action in actions if key_of(action) != key_of(played))
+        return (Attempt(decisions, action) for action in others)
+    topologies = (action for action in actions if action != topology_part(played))
+    return (Attempt(decisions, _with_topology(played, topology)) for topology in topologies)
 
 
 def _with_topology(action: Action, topology: int) -> Action:

@@ -16,6 +16,7 @@ from rl2grid.agents.agent import (
     Info,
     Observation,
     OverruledAgent,
+    ProposingAgent,
     topology_part,
 )
 from rl2grid.agents.courses import Averted, Course, Courses, Guided, Reach
@@ -43,7 +44,8 @@ class Rehearsal(Guided):
     goes well. So lines may trip on the way if what is left of the grid lives: no search for a safe state a few steps
     ahead finds such courses. It knows what an operator knows, and nothing else.
 
-    In a joint task the guide injects, and topology actions are replaced.
+    In a joint task the guide injects, and topology actions are replaced. In a redispatching task other injections are
+    tried, which the guide has to propose: a policy does.
 
     Args:
         guide: who plays while the grid is safe, and a copy of whom plays in rehearsals; None: the planner.
@@ -56,7 +58,7 @@ class Rehearsal(Guided):
     """
 
     name = "rehearsal"
-    kinds = ("T", "H")
+    kinds: tuple[str, ...] = ("T", "H")
     rules: ClassVar[Mapping[str, int]] = {"H": Planner.rules["H"]}  # of the guide, which injects
 
     def __init__(
@@ -73,14 +75,14 @@ class Rehearsal(Guided):
         """Make a copy of the environment, in which crises are rehearsed.
 
         Raises:
-            UsageError: a redispatching task, which has no topology actions to try, or the reference engine, which
-                imagines nothing.
+            UsageError: a redispatching task, which has no topology actions to try, and a guide that proposes no
+                injections, or the reference engine, which imagines nothing.
         """
         base: Any = env.unwrapped
-        if not base.task.changes_topology:
+        if not (base.task.changes_topology or isinstance(self._guide, ProposingAgent)):
             raise UsageError(
                 f"Agent {self.name!r} cannot play a redispatching task (-R-), which has no topology actions: "
-                "choose planner, or a task with topology."
+                "choose planner, a policy as the guide, or a task with topology."
             )
         if not isinstance(base.engine, NativeEngine):
             raise UsageError(f'Agent {self.name!r} imagines worlds of the native engine: choose engine="native".')
@@ -107,7 +109,7 @@ class Rehearsal(Guided):
         course = self._rehearsed(int(state.step[0]), proposed)
         action = course.decisions[0].action
         self._kept = [decision.action for decision in course.decisions[1:]]
-        if topology_part(action) != topology_part(proposed) and isinstance(self._guide, OverruledAgent):
+        if isinstance(self._guide, OverruledAgent) and topology_part(action) != topology_part(proposed):
             self._guide.overruled(action)
         return action
 

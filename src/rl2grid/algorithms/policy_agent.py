@@ -29,6 +29,12 @@ BEST_FILE = "best.pt"
 """In a run folder: the policy with the highest validation survival so far."""
 CHECKPOINT_FILE = "checkpoint.pt"
 """In a run folder: everything needed to go on."""
+WIDTH = 3.0
+"""How much further away than a policy explores a better continuous action is looked for."""
+
+PROPOSALS = 100
+"""Continuous actions from which those are chosen that are tried in rehearsals."""
+
 _EXPLAINED = 2000
 """Actions of which an explanation tells at most."""
 MAX_WEIGHT = 1e8
@@ -144,14 +150,18 @@ class PolicyAgent:
         """Whether there is nothing to draw: TD3's policy has one action for an observation, and no distribution."""
         return not hasattr(self._network, "distribution")
 
-    def draws(self, observation: Observation, k: int, width: float) -> list[Action]:
-        """``k`` continuous actions, ``width`` times as far from the most probable one as its distribution draws."""
+    def draws(self, observation: Observation, k: int) -> list[Action]:
+        """``k`` continuous actions, :data:`WIDTH` times as far from the most probable one as its distribution draws."""
         observations, masks = self._inputs(observation)
         with torch.no_grad():
             probable = self._network.act(observations, masks, None).clamp(-1.0, 1.0)
             drawn = self._network.act(observations.expand(k, -1), masks, self._generator)
-        actions = (probable + width * (drawn - probable)).clamp(-1.0, 1.0)
+        actions = (probable + WIDTH * (drawn - probable)).clamp(-1.0, 1.0)
         return [self._as_action(action) for action in actions.numpy()]
+
+    def proposals(self, observation: Observation, info: Info) -> list[Action]:
+        """Of continuous actions the most probable one, and what is drawn around it, :data:`PROPOSALS` in all."""
+        return [self.act(observation, info), *self.draws(observation, PROPOSALS - 1)]
 
     def _inputs(self, observation: Observation) -> tuple[torch.Tensor, torch.Tensor | None]:
         """An observation as the network reads it, and the actions that it may play, each with one row."""

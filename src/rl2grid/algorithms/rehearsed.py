@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
+from rl2grid.agents.agent import RandomizedAgent
 from rl2grid.agents.rehearsal import Rehearsal
 from rl2grid.algorithms.policy_agent import PolicyAgent
 from rl2grid.algorithms.top_k import TopK
@@ -16,24 +17,32 @@ class Rehearsed(Rehearsal):
     """Plays what a policy plays; in a crisis, only after it went well in an imagined world.
 
     What :class:`~rl2grid.agents.rehearsal.Rehearsal` does with the planner as its guide, with a policy in its place,
-    which plays on in rehearsals in a fraction of the planner's time.
+    which plays on in rehearsals in a fraction of the planner's time. In a redispatching task other injections are
+    tried: of a hundred, drawn around the policy's, those that leave the least worst loading in the next step.
 
     Args:
         policy: the guide, not bound yet.
         steps: grid steps of a rehearsal.
 
     Raises:
-        UsageError: ``steps`` is below 1, or the policy plays a redispatching task.
+        UsageError: ``steps`` is below 1, or the policy plays a redispatching task and draws nothing.
     """
 
+    kinds = ("T", "R", "H")
     rules: ClassVar[Mapping[str, int]] = {}
 
     def __init__(self, policy: PolicyAgent | TopK, steps: int) -> None:
         if steps < 1:
             raise UsageError(f"rehearse={steps} is not allowed: give a number of grid steps, at least 1.")
-        if find_task(policy.task).kind not in self.kinds:
-            raise UsageError(f"A policy of {policy.task} has no topology actions to rehearse: leave rehearse out.")
+        if isinstance(policy, PolicyAgent) and policy.is_deterministic and find_task(policy.task).kind == "R":
+            raise UsageError("TD3's policy draws no other actions to rehearse: leave rehearse out.")
         super().__init__(policy, ahead=steps)
         self.name = f"{policy.name}, rehearsing {steps} steps"
         self.task, self.env_keywords = policy.task, policy.env_keywords
         self.identity: dict[str, Any] = {**policy.identity, "rehearse": steps}
+
+    def seed_episode(self, seed: int, episode: int) -> None:
+        """Draw from the stream (``seed``, ``episode``) from now on, in rehearsals from another one."""
+        for place, policy in enumerate((self._guide, self._understudy)):
+            assert isinstance(policy, RandomizedAgent)
+            policy.seed_episode(seed, episode ^ place)

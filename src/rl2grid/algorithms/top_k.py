@@ -14,9 +14,6 @@ from rl2grid.arrays import F64
 from rl2grid.errors import UsageError
 from rl2grid.mdp.heuristics import SAFE_RHO
 
-WIDTH = 3.0
-"""How much further away than a policy explores a better continuous action is looked for."""
-
 
 class TopK:
     """Plays the first of a policy's ``k`` best legal actions that the forecast calls safe.
@@ -26,8 +23,8 @@ class TopK:
     ``k`` (:meth:`PowerGridEnv.what_if`), others one ``simulate`` each.
 
     Continuous actions have no best few: the candidates are the most probable one and, where the forecast does not call
-    that safe, ``k`` - 1 around it, :data:`WIDTH` times as far away as the policy draws, from the stream of the episode
-    (:meth:`seed_episode`).
+    that safe, ``k`` - 1 around it, :data:`~rl2grid.algorithms.policy_agent.WIDTH` times as far away as the policy
+    draws, from the stream of the episode (:meth:`seed_episode`).
 
     Args:
         policy: a policy, not bound yet.
@@ -78,6 +75,10 @@ class TopK:
         self._considered = Considered(self._policy.preference, candidates, preferences, _why(chosen, len(safe) > 0))
         return candidates[chosen]
 
+    def proposals(self, observation: Observation, info: Info) -> list[Action]:
+        """Those of the policy."""
+        return self._policy.proposals(observation, info)
+
     def explain(self) -> Considered | None:
         """What the last decision compared and why it was played: candidates by the policy's preference, continuous ones
         by the worst loading by the forecast.
@@ -91,7 +92,7 @@ class TopK:
             return candidates[0]
         loading = [self._foreseen(candidates[0])]
         if loading[0] >= SAFE_RHO:
-            for action in self._policy.draws(observation, self._k - 1, WIDTH):
+            for action in self._policy.draws(observation, self._k - 1):
                 candidates.append(action)
                 loading.append(self._foreseen(action))
                 if loading[-1] < SAFE_RHO:
