@@ -31,10 +31,8 @@ CHECKPOINT_FILE = "checkpoint.pt"
 """In a run folder: everything needed to go on."""
 WIDTH = 3.0
 """How much further away than a policy explores a better continuous action is looked for."""
-
 PROPOSALS = 100
 """Continuous actions from which those are chosen that are tried in rehearsals."""
-
 _EXPLAINED = 2000
 """Actions of which an explanation tells at most."""
 MAX_WEIGHT = 1e8
