@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import gymnasium
@@ -125,6 +125,13 @@ class OverruledAgent(Protocol):
 
     def overruled(self, played: Action) -> None:
         """Not the last ``act`` was played but this; the next one is asked for what follows from there."""
+
+
+def seed_together(agents: Iterable[Agent | None], seed: int, episode: int) -> None:
+    """Let agents that play the same episode draw from streams of their own; those that draw nothing are passed over."""
+    for place, agent in enumerate(agents):
+        if isinstance(agent, RandomizedAgent):
+            agent.seed_episode(seed, episode ^ place)
 
 
 def no_intervention(space: gymnasium.Space[Any]) -> Action:

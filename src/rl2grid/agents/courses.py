@@ -19,9 +19,8 @@ from rl2grid.agents.agent import (
     ProposingAgent,
     key_of,
     no_intervention,
-    topology_part,
 )
-from rl2grid.agents.dispatch import loading_of
+from rl2grid.agents.dispatch import worst_loading_if_legal
 from rl2grid.agents.planner import Planner
 from rl2grid.engines.worlds import World
 from rl2grid.errors import UsageError
@@ -216,8 +215,7 @@ class Courses:
     def _best_proposed(self, observation: Observation, info: Info) -> list[Action]:
         assert isinstance(self._guide, ProposingAgent)
         proposed = self._guide.proposals(observation, info)
-        results = [self._env.simulate(action) for action in proposed]
-        loading = np.array([np.inf if each.info["illegal"] else loading_of(self._env, each) for each in results])
+        loading = np.array([worst_loading_if_legal(self._env, action) for action in proposed])
         best = np.argsort(loading, kind="stable")[: self._candidates]
         return [*(proposed[k] for k in best if np.isfinite(loading[k])), no_intervention(self._env.action_space)]
 
@@ -233,12 +231,9 @@ def begin_of_crisis(decisions: Sequence[Decision]) -> int:
 def _others(decisions: Sequence[Decision], actions: Iterable[Action]) -> Iterator[Attempt]:
     """The last decision with other actions; what it injects in a joint task stays."""
     played = decisions[-1].action
-    if isinstance(played, np.ndarray):
-        others = (action for action in actions if key_of(action) != key_of(played))
-        return (Attempt(decisions, action) for action in others)
-    topologies = (action for action in actions if action != topology_part(played))
-    return (Attempt(decisions, _with_topology(played, topology)) for topology in topologies)
+    others = (_in_place_of(played, action) for action in actions)
+    return (Attempt(decisions, other) for other in others if key_of(other) != key_of(played))
 
 
-def _with_topology(action: Action, topology: int) -> Action:
-    return {**action, TOPOLOGY: topology} if isinstance(action, Mapping) else topology
+def _in_place_of(played: Action, action: Action) -> Action:
+    return {**played, TOPOLOGY: action} if isinstance(played, Mapping) else action

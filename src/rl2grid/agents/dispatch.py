@@ -169,9 +169,14 @@ def control_positions(grid: Grid) -> NDArray[np.int32]:
 
 def worst_loading(env: Any, action: Action) -> float:
     """The largest loading that :meth:`PowerGridEnv.simulate` foresees; infinite where the game would be lost."""
-    return loading_of(env, env.simulate(action))
+    return _loading_of(env, env.simulate(action))
 
 
-def loading_of(env: Any, result: Any) -> float:
-    """The largest loading in what :meth:`PowerGridEnv.simulate` returned; infinite where the game would be lost."""
+def worst_loading_if_legal(env: Any, action: Action) -> float:
+    """The same; infinite as well where the action would be refused, of which nothing is foreseen."""
+    result = env.simulate(action)
+    return np.inf if result.info["illegal"] else _loading_of(env, result)
+
+
+def _loading_of(env: Any, result: Any) -> float:
     return np.inf if result.terminated else float(result.observation[env.observation_slices["rho"]].max())

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-from rl2grid.agents.agent import RandomizedAgent
+from rl2grid.agents.agent import seed_together
 from rl2grid.agents.rehearsal import Rehearsal
 from rl2grid.algorithms.policy_agent import PolicyAgent
 from rl2grid.algorithms.top_k import TopK
@@ -43,6 +43,4 @@ class Rehearsed(Rehearsal):
 
     def seed_episode(self, seed: int, episode: int) -> None:
         """Draw from the stream (``seed``, ``episode``) from now on, in rehearsals from another one."""
-        for place, policy in enumerate((self._guide, self._understudy)):
-            assert isinstance(policy, RandomizedAgent)
-            policy.seed_episode(seed, episode ^ place)
+        seed_together((self._guide, self._understudy), seed, episode)

@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 
 from rl2grid.agents.agent import Action, Considered, Info, Observation
-from rl2grid.agents.dispatch import loading_of
+from rl2grid.agents.dispatch import worst_loading_if_legal
 from rl2grid.algorithms.policy_agent import PolicyAgent
 from rl2grid.arrays import F64
 from rl2grid.errors import UsageError
@@ -90,11 +90,11 @@ class TopK:
         candidates = [self._policy.act(observation, info)]
         if self._k == 1:
             return candidates[0]
-        loading = [self._foreseen(candidates[0])]
+        loading = [worst_loading_if_legal(self._env, candidates[0])]
         if loading[0] >= SAFE_RHO:
             for action in self._policy.draws(observation, self._k - 1):
                 candidates.append(action)
-                loading.append(self._foreseen(action))
+                loading.append(worst_loading_if_legal(self._env, action))
                 if loading[-1] < SAFE_RHO:
                     break
         order = np.argsort(loading, kind="stable").tolist()
@@ -107,12 +107,7 @@ class TopK:
         """The worst loading in the next step after each, by the forecast; infinite where the game would be lost."""
         if self._asks_at_once:
             return np.asarray(self._env.what_if(candidates).worst_loading, np.float64)
-        return np.array([self._foreseen(action) for action in candidates])
-
-    def _foreseen(self, action: Action) -> float:
-        """The worst loading after an action; of one that would be refused nothing is foreseen, as of a lost game."""
-        result = self._env.simulate(action)
-        return np.inf if result.info["illegal"] else loading_of(self._env, result)
+        return np.array([worst_loading_if_legal(self._env, action) for action in candidates])
 
 
 def _why(chosen: int, is_safe: bool) -> str:

@@ -17,7 +17,6 @@ from rl2grid.agents.agent import (
     Info,
     Observation,
     OverruledAgent,
-    RandomizedAgent,
     RankingAgent,
     has_injections,
     has_topology_actions,
@@ -25,6 +24,7 @@ from rl2grid.agents.agent import (
     intervenes,
     key_of,
     no_intervention,
+    seed_together,
     topology_part,
 )
 from rl2grid.arrays import F32, F64, I64, Flags
@@ -100,9 +100,7 @@ class Labeller:
         """Draw from streams of that seed, in the teacher and the pupil too."""
         self._thinning = Stream(seed, _THINNING, Purpose.AGENT)
         self._sharing = Stream(seed, _SHARING, Purpose.AGENT)
-        for place, agent in enumerate((self._teacher, self._pupil)):
-            if isinstance(agent, RandomizedAgent):
-                agent.seed_episode(seed, episode ^ place)
+        seed_together((self._teacher, self._pupil), seed, episode)
 
     def reset(self, i: int) -> None:
         """Forget the last episode."""
