@@ -1,0 +1,174 @@
+"""How agents outlive overloads: by ending them, or by moving them from line to line before protections trip one.
+
+``python benchmarks/crises.py TASK AGENT[:HEURISTIC] ... [--months N] [--skip N]`` plays validation months. A *crisis*
+is a row of grid steps in each of which a line is above its limit. Protections trip a line that stays above it for
+longer than the rules allow, three steps, so that who outlives a longer crisis has moved the overload from line to line
+in time, or lives without the lines that tripped. Of every agent:
+
+- crises, and those that lasted longer than that; how many of the latter were outlived;
+- their mean length, and that of the longest that was outlived;
+- after how many steps above its limit a line was relieved that stays in service, and how often another line was above
+  its limit then, so that the overload was moved and not ended;
+- per 100 steps of long crises, lines above their limit that the agent opened, and those that protections tripped.
+
+It writes ``benchmarks/results/crises.json``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gains import validation_months
+
+from rl2grid.agents.agent import Agent
+from rl2grid.arrays import Flags
+from rl2grid.envs.tasks import find_task, short_id
+from rl2grid.evaluation.agents import make_agent
+from rl2grid.evaluation.episode import play_episode
+from rl2grid.mdp.state import GridState
+from rl2grid.records.files import write_json
+from rl2grid.scenarios.splits import VALIDATION
+
+RESULTS = Path(__file__).resolve().parent / "results" / "crises.json"
+
+
+@dataclass
+class Crises:
+    """Rows of steps with an overload, of all months."""
+
+    allowed: int = 0
+    """Steps for which the rules let a line be above its limit."""
+    lengths: list[int] = field(default_factory=list)
+    outlived: list[bool] = field(default_factory=list)
+    relieved_after: Counter[int] = field(default_factory=Counter)
+    """Lines that fell below their limit and stayed in service, by the steps they had been above it."""
+    moved: int = 0
+    """Of these, how many did while another line was above its limit."""
+    opened: int = 0
+    """Lines above their limit that were opened in a long crisis."""
+    tripped: int = 0
+    """Those that protections tripped there."""
+
+
+class Witness:
+    """An agent, and the crises of the grid while it played."""
+
+    def __init__(self, agent: Agent) -> None:
+        self.agent, self.found = agent, Crises()
+        self._length, self._opened, self._tripped = 0, 0, 0
+        self._above = np.zeros(0, np.int64)
+        self._env: Any = None
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.agent, name)
+
+    def bind(self, env: gymnasium.Env[Any, Any]) -> None:
+        """Listen to the grid steps of ``env``."""
+        self._env = env.unwrapped
+        self._env.step_listeners.append(self.hear)
+        self.found.allowed = self._env.grid.rules.overflow_allowed
+        self.agent.bind(env)
+
+    def hear(self, state: GridState, row: int) -> None:
+        """Count a grid step that was really played; that of a game over ends the crisis."""
+        if self._env.imagined:
+            return
+        if state.step[row] == 0:
+            self._length, self._above = 0, np.zeros(state.rho.shape[1], np.int64)
+        if state.terminated[row]:
+            self._end(outlived=False)
+            return
+        above = state.rho[row] > 1.0
+        self._count(above, state, row)
+        self._above = np.where(above, self._above + 1, 0)
+        if above.any():
+            self._length += 1
+        else:
+            self._end(outlived=True)
+
+    def _count(self, above: Flags, state: GridState, row: int) -> None:
+        """Lines above their limit before this step that it relieved, opened or tripped."""
+        before, in_service = self._above > 0, state.line_status[row]
+        relieved = before & ~above & in_service
+        self.found.relieved_after.update(self._above[relieved].tolist())
+        self.found.moved += int(relieved.sum()) if above.any() else 0
+        out = before & ~in_service & ~state.attacked[row] & (state.time_next_maintenance[row] != 0)
+        # Protections keep a line open for longer than the rule for switching does.
+        tripped = out & (state.time_before_cooldown_line[row] > self._env.grid.rules.cooldown_line)
+        self._tripped += int(tripped.sum())
+        self._opened += int((out & ~tripped).sum())
+
+    def _end(self, outlived: bool) -> None:
+        if self._length:
+            self.found.lengths.append(self._length)
+            self.found.outlived.append(outlived)
+        if self._length > self.found.allowed:
+            self.found.opened += self._opened
+            self.found.tripped += self._tripped
+        self._length, self._opened, self._tripped = 0, 0, 0
+
+    def act(self, observation: Any, info: Any) -> Any:
+        """The agent's action."""
+        return self.agent.act(observation, info)
+
+
+def crises_of(task_id: str, word: str, skip: int, months: int) -> dict[str, Any]:
+    """Play the months and count."""
+    task = find_task(task_id)
+    name, _, heuristic = word.partition(":")
+    witness = Witness(make_agent(name, task))
+    keywords = getattr(witness.agent, "env_keywords", {}) | {"split": VALIDATION, "heuristic": heuristic or None}
+    env = gymnasium.make(task.id, **keywords, disable_env_checker=True)
+    witness.bind(env)
+    survival = []
+    for scenario in validation_months(task, skip, months):
+        survival.append(play_episode(witness, env, scenario=scenario, seed=0).survival)
+        print(short_id(task.id), word, scenario, round(survival[-1], 3), len(witness.found.lengths), flush=True)
+    env.close()
+    return {"months": [skip, skip + months], "survival": round(float(np.mean(survival)), 4), **_summary(witness.found)}
+
+
+def _summary(found: Crises) -> dict[str, Any]:
+    lengths, outlived = np.array(found.lengths, np.int64), np.array(found.outlived, bool)
+    long = lengths > found.allowed
+    relieved = sum(found.relieved_after.values())
+    return {
+        "crises": len(lengths),
+        "outlived": int(outlived.sum()),
+        "long_crises": int(long.sum()),
+        "long_outlived": int((long & outlived).sum()),
+        "mean_length_of_long": round(float(lengths[long].mean()), 2) if long.any() else None,
+        "longest_outlived": int(lengths[outlived].max(initial=0)),
+        "relieved": relieved,
+        "relieved_while_another_is_above": found.moved,
+        "relieved_after": {str(steps): n for steps, n in sorted(found.relieved_after.items())},
+        "opened_per_100_long_steps": round(100 * found.opened / max(int(lengths[long].sum()), 1), 2),
+        "tripped_per_100_long_steps": round(100 * found.tripped / max(int(lengths[long].sum()), 1), 2),
+    }
+
+
+def main() -> None:
+    """Play what is asked for, and write it beside what is there."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("task", metavar="TASK")
+    parser.add_argument("agents", nargs="+", metavar="AGENT[:HEURISTIC]")
+    parser.add_argument("--months", type=int, default=20)
+    parser.add_argument("--skip", type=int, default=40)
+    arguments = parser.parse_args()
+    for word in arguments.agents:
+        found = crises_of(arguments.task, word, arguments.skip, arguments.months)
+        print(json.dumps(found, indent=1))
+        results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+        results[f"{short_id(find_task(arguments.task).id)} {word}"] = found
+        write_json(RESULTS, results, indent=1)
+
+
+if __name__ == "__main__":
+    main()
