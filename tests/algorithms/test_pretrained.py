@@ -80,6 +80,9 @@ def test_the_command_lists_them_and_tells_the_card_of_one(capsys: Any):
     assert main(["pretrained"]) == 0
     listed = capsys.readouterr().out
     assert all(f"pretrained/{card.name}" in listed for card in cards())
+    lines = {line.split()[0]: line for line in listed.splitlines() if line.startswith("pretrained/")}
+    assert "0.794 best of 100" in lines["pretrained/bus118-MOB-v1-H1"]
+    assert "best of" not in lines["pretrained/bus36-MO-v0-T0"]  # it survives less long so
     assert main(["pretrained", "pretrained/bus14-T0"]) == 0
     told = capsys.readouterr().out
     assert "rl2grid teach greedy bus14-T0" in told

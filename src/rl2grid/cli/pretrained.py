@@ -16,8 +16,8 @@ _COLUMNS = (
     Column("heuristic", words=True),
     Column("made by", words=True),
     Column("survival"),
+    Column("looking before it acts", words=True),
     Column("months"),
-    Column("kB"),
 )
 
 
@@ -34,7 +34,7 @@ def _run(options: argparse.Namespace, output: Output) -> int:
     rows = tuple(tuple(Cell(text) for text in _cells(card)) for card in every)
     table = ResultTable("pretrained", "", _COLUMNS, rows)
     output.table(table, [_record(card) for card in every], title="Survival on validation months")
-    output.remark("Play one: `rl2grid watch pretrained/NAME TASK`. How it was made: `rl2grid pretrained NAME`.")
+    output.remark("Play one: `rl2grid watch pretrained/NAME TASK`, looking: `--top-k K`. How it was made: `rl2grid pretrained NAME`.")
     return 0
 
 
@@ -63,7 +63,15 @@ def _cells(card: ModelCard) -> tuple[str, ...]:
     own = card.validation[0]
     survival = with_interval(own.estimate, 3)
     heuristic = card.heuristic or "none"
-    return (PREFIX + card.name, card.task, heuristic, card.algorithm, survival, str(own.months), str(_size(card)))
+    return (PREFIX + card.name, card.task, heuristic, card.algorithm, survival, _looking(card), str(own.months))
+
+
+def _looking(card: ModelCard) -> str:
+    """The way of looking by which the policy survives longest, if that is longer than without."""
+    own, *others = card.validation
+    looking = [each for each in others if each.agent.startswith(own.agent)]
+    best = max(looking, key=lambda each: each.survival, default=own)
+    return f"{best.survival:.3f} {best.agent.removeprefix(f'{own.agent}, ')}" if best.survival > own.survival else ""
 
 
 def _size(card: ModelCard) -> int:
