@@ -34,7 +34,10 @@ def _run(options: argparse.Namespace, output: Output) -> int:
     rows = tuple(tuple(Cell(text) for text in _cells(card)) for card in every)
     table = ResultTable("pretrained", "", _COLUMNS, rows)
     output.table(table, [_record(card) for card in every], title="Survival on validation months")
-    output.remark("Play one: `rl2grid watch pretrained/NAME TASK`, looking: `--top-k K`. How it was made: `rl2grid pretrained NAME`.")
+    output.remark(
+        "Play one: `rl2grid watch pretrained/NAME TASK`, looking: `--top-k K`. "
+        "How it was made: `rl2grid pretrained NAME`."
+    )
     return 0
 
 
