@@ -81,7 +81,8 @@ class Witness:
         if self._env.imagined:
             return
         if state.step[row] == 0:
-            self._length, self._above = 0, np.zeros(state.rho.shape[1], np.int64)
+            self._length, self._opened, self._tripped = 0, 0, 0
+            self._above = np.zeros(state.rho.shape[1], np.int64)
         if state.terminated[row]:
             self._end(outlived=False)
             return
