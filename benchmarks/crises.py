@@ -19,13 +19,14 @@ from __future__ import annotations
 import argparse
 import json
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 from gains import validation_months
+from witness import Witness
 
 from rl2grid.agents.agent import Agent
 from rl2grid.arrays import Flags
@@ -40,49 +41,34 @@ RESULTS = Path(__file__).resolve().parent / "results" / "crises.json"
 
 
 @dataclass
-class Crises:
-    """Rows of steps with an overload, of all months."""
+class Crisis:
+    """A row of steps with an overload."""
 
-    allowed: int = 0
-    """Steps for which the rules let a line be above its limit."""
-    lengths: list[int] = field(default_factory=list)
-    outlived: list[bool] = field(default_factory=list)
-    relieved_after: Counter[int] = field(default_factory=Counter)
-    """Lines that fell below their limit and stayed in service, by the steps they had been above it."""
-    moved: int = 0
-    """Of these, how many did while another line was above its limit."""
+    length: int = 0
+    outlived: bool = False
     opened: int = 0
-    """Lines above their limit that were opened in a long crisis."""
+    """Lines above their limit that were opened in it."""
     tripped: int = 0
-    """Those that protections tripped there."""
+    """Those that protections tripped."""
 
 
-class Witness:
+class CrisisWitness(Witness):
     """An agent, and the crises of the grid while it played."""
 
     def __init__(self, agent: Agent) -> None:
-        self.agent, self.found = agent, Crises()
-        self._length, self._opened, self._tripped = 0, 0, 0
+        super().__init__(agent)
+        self.crises: list[Crisis] = []
+        self.relieved_after: Counter[int] = Counter()
+        """Lines that fell below their limit and stayed in service, by the steps they had been above it."""
+        self.moved = 0
+        """Of these, how many did while another line was above its limit."""
+        self._now = Crisis()
         self._above = np.zeros(0, np.int64)
-        self._env: Any = None
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.agent, name)
-
-    def bind(self, env: gymnasium.Env[Any, Any]) -> None:
-        """Listen to the grid steps of ``env``."""
-        self._env = env.unwrapped
-        self._env.step_listeners.append(self.hear)
-        self.found.allowed = self._env.grid.rules.overflow_allowed
-        self.agent.bind(env)
 
     def hear(self, state: GridState, row: int) -> None:
-        """Count a grid step that was really played; that of a game over ends the crisis."""
-        if self._env.imagined:
-            return
+        """Count a grid step; that of a game over ends the crisis."""
         if state.step[row] == 0:
-            self._length, self._opened, self._tripped = 0, 0, 0
-            self._above = np.zeros(state.rho.shape[1], np.int64)
+            self._now, self._above = Crisis(), np.zeros(state.rho.shape[1], np.int64)
         if state.terminated[row]:
             self._end(outlived=False)
             return
@@ -90,7 +76,7 @@ class Witness:
         self._count(above, state, row)
         self._above = np.where(above, self._above + 1, 0)
         if above.any():
-            self._length += 1
+            self._now.length += 1
         else:
             self._end(outlived=True)
 
@@ -98,60 +84,51 @@ class Witness:
         """Lines above their limit before this step that it relieved, opened or tripped."""
         before, in_service = self._above > 0, state.line_status[row]
         relieved = before & ~above & in_service
-        self.found.relieved_after.update(self._above[relieved].tolist())
-        self.found.moved += int(relieved.sum()) if above.any() else 0
+        self.relieved_after.update(self._above[relieved].tolist())
+        self.moved += int(relieved.sum()) if above.any() else 0
         out = before & ~in_service & ~state.attacked[row] & (state.time_next_maintenance[row] != 0)
         # Protections keep a line open for longer than the rule for switching does.
-        tripped = out & (state.time_before_cooldown_line[row] > self._env.grid.rules.cooldown_line)
-        self._tripped += int(tripped.sum())
-        self._opened += int((out & ~tripped).sum())
+        tripped = out & (state.time_before_cooldown_line[row] > self.env.grid.rules.cooldown_line)
+        self._now.tripped += int(tripped.sum())
+        self._now.opened += int((out & ~tripped).sum())
 
     def _end(self, outlived: bool) -> None:
-        if self._length:
-            self.found.lengths.append(self._length)
-            self.found.outlived.append(outlived)
-        if self._length > self.found.allowed:
-            self.found.opened += self._opened
-            self.found.tripped += self._tripped
-        self._length, self._opened, self._tripped = 0, 0, 0
-
-    def act(self, observation: Any, info: Any) -> Any:
-        """The agent's action."""
-        return self.agent.act(observation, info)
+        if self._now.length:
+            self.crises.append(replace(self._now, outlived=outlived))
+        self._now = Crisis()
 
 
 def crises_of(task_id: str, word: str, skip: int, months: int) -> dict[str, Any]:
     """Play the months and count."""
     task = find_task(task_id)
     name, _, heuristic = word.partition(":")
-    witness = Witness(make_agent(name, task))
+    witness = CrisisWitness(make_agent(name, task))
     keywords = getattr(witness.agent, "env_keywords", {}) | {"split": VALIDATION, "heuristic": heuristic or None}
     env = gymnasium.make(task.id, **keywords, disable_env_checker=True)
     witness.bind(env)
     survival = []
     for scenario in validation_months(task, skip, months):
         survival.append(play_episode(witness, env, scenario=scenario, seed=0).survival)
-        print(short_id(task.id), word, scenario, round(survival[-1], 3), len(witness.found.lengths), flush=True)
+        print(short_id(task.id), word, scenario, round(survival[-1], 3), len(witness.crises), flush=True)
     env.close()
-    return {"months": [skip, skip + months], "survival": round(float(np.mean(survival)), 4), **_summary(witness.found)}
+    return {"months": [skip, skip + months], "survival": round(float(np.mean(survival)), 4), **_summary(witness)}
 
 
-def _summary(found: Crises) -> dict[str, Any]:
-    lengths, outlived = np.array(found.lengths, np.int64), np.array(found.outlived, bool)
-    long = lengths > found.allowed
-    relieved = sum(found.relieved_after.values())
+def _summary(witness: CrisisWitness) -> dict[str, Any]:
+    long = [each for each in witness.crises if each.length > witness.env.grid.rules.overflow_allowed]
+    steps = sum(each.length for each in long)
     return {
-        "crises": len(lengths),
-        "outlived": int(outlived.sum()),
-        "long_crises": int(long.sum()),
-        "long_outlived": int((long & outlived).sum()),
-        "mean_length_of_long": round(float(lengths[long].mean()), 2) if long.any() else None,
-        "longest_outlived": int(lengths[outlived].max(initial=0)),
-        "relieved": relieved,
-        "relieved_while_another_is_above": found.moved,
-        "relieved_after": {str(steps): n for steps, n in sorted(found.relieved_after.items())},
-        "opened_per_100_long_steps": round(100 * found.opened / max(int(lengths[long].sum()), 1), 2),
-        "tripped_per_100_long_steps": round(100 * found.tripped / max(int(lengths[long].sum()), 1), 2),
+        "crises": len(witness.crises),
+        "outlived": sum(each.outlived for each in witness.crises),
+        "long_crises": len(long),
+        "long_outlived": sum(each.outlived for each in long),
+        "mean_length_of_long": round(steps / len(long), 2) if long else None,
+        "longest_outlived": max((each.length for each in witness.crises if each.outlived), default=0),
+        "relieved": witness.relieved_after.total(),
+        "relieved_while_another_is_above": witness.moved,
+        "relieved_after": {str(steps): n for steps, n in sorted(witness.relieved_after.items())},
+        "opened_per_100_long_steps": round(100 * sum(each.opened for each in long) / max(steps, 1), 2),
+        "tripped_per_100_long_steps": round(100 * sum(each.tripped for each in long) / max(steps, 1), 2),
     }
 
 

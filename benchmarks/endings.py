@@ -16,13 +16,14 @@ from __future__ import annotations
 import argparse
 import json
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 from gains import validation_months
+from witness import Witness
 
 import rl2grid  # noqa: F401  (registers the tasks)
 from rl2grid.agents.agent import Action, Agent
@@ -50,30 +51,22 @@ class Crisis:
     """What the best single action would have left."""
 
 
-@dataclass
-class Witness:
-    """An agent, and what became of the grid while it played."""
+class EndWitness(Witness):
+    """An agent, and what became of the grid while it played.
 
-    agent: Agent
-    tries: bool
-    """Whether the actions of the level are tried when a crisis begins."""
-    crisis: Crisis | None = None
-    _env: Any = None
-    _out: Any = field(default=None, repr=False)
+    Args:
+        agent: who decides.
+        tries: whether the actions of the level are tried when a crisis begins.
+    """
 
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.agent, name)
-
-    def bind(self, env: gymnasium.Env[Any, Any]) -> None:
-        """Listen to the grid steps of ``env``."""
-        self._env = env.unwrapped
-        self._env.step_listeners.append(self.hear)
-        self.agent.bind(env)
+    def __init__(self, agent: Agent, tries: bool) -> None:
+        super().__init__(agent)
+        self.tries = tries
+        self.crisis: Crisis | None = None
+        self._out: Any = None
 
     def hear(self, state: GridState, row: int) -> None:
-        """Note a grid step that was really played; that of a game over shows nothing."""
-        if self._env.imagined:
-            return
+        """Note a grid step; that of a game over shows nothing."""
         if state.step[row] == 0:
             self.crisis, self._out = None, None
         if state.terminated[row]:
@@ -89,10 +82,10 @@ class Witness:
     def act(self, observation: Any, info: Any) -> Action:
         """The agent's action."""
         if self.tries and self.crisis is not None and self.crisis.best is None:
-            outcomes = self._env.what_if()
+            outcomes = self.env.what_if()
             left = np.where(outcomes.legal & (outcomes.verdict == 0), outcomes.worst_loading, np.inf)
             self.crisis.best = float(left.min())
-        return self.agent.act(observation, info)
+        return super().act(observation, info)
 
 
 def _lost(before: Any, out: Any) -> str:
@@ -109,7 +102,7 @@ def ends_of(task_id: str, word: str, skip: int, months: int) -> dict[str, Any]:
     """Play the months and say how the lost ones end."""
     task = find_task(task_id)
     name, _, heuristic = word.partition(":")
-    witness = Witness(make_agent(name, task), tries=task.kind == "T")
+    witness = EndWitness(make_agent(name, task), tries=task.kind == "T")
     env = gymnasium.make(task.id, split=VALIDATION, heuristic=heuristic or None, disable_env_checker=True)
     witness.bind(env)
     lost = []
