@@ -9,7 +9,9 @@ in time, or lives without the lines that tripped. Of every agent:
 - their mean length, and that of the longest that was outlived;
 - after how many steps above its limit a line was relieved that stays in service, and how often another line was above
   its limit then, so that the overload was moved and not ended;
-- per 100 steps of long crises, lines above their limit that the agent opened, and those that protections tripped.
+- per 100 steps of long crises, lines above their limit that the agent opened, and those that protections tripped;
+- attacks on every line, and how many were lost: the game was over before the opponent had let go of the line and no
+  line was above its limit.
 
 It writes ``benchmarks/results/crises.json``.
 """
@@ -23,10 +25,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import numpy as np
 from gains import validation_months
-from witness import Witness
+from witness import Witness, validation_environment
 
 from rl2grid.agents.agent import Agent
 from rl2grid.arrays import Flags
@@ -35,7 +36,6 @@ from rl2grid.evaluation.agents import make_agent
 from rl2grid.evaluation.episode import play_episode
 from rl2grid.mdp.state import GridState
 from rl2grid.records.files import write_json
-from rl2grid.scenarios.splits import VALIDATION
 
 RESULTS = Path(__file__).resolve().parent / "results" / "crises.json"
 
@@ -62,6 +62,12 @@ class CrisisWitness(Witness):
         """Lines that fell below their limit and stayed in service, by the steps they had been above it."""
         self.moved = 0
         """Of these, how many did while another line was above its limit."""
+        self.attacks: Counter[int] = Counter()
+        """By line."""
+        self.lost: Counter[int] = Counter()
+        """Of these, those that were not outlived."""
+        self._attacked: set[int] = set()
+        """Lines of attacks that are not outlived yet."""
         self._now = Crisis()
         self._above = np.zeros(0, np.int64)
 
@@ -69,10 +75,13 @@ class CrisisWitness(Witness):
         """Count a grid step; that of a game over ends the crisis."""
         if state.step[row] == 0:
             self._now, self._above = Crisis(), np.zeros(state.rho.shape[1], np.int64)
+            self._attacked = set()
         if state.terminated[row]:
             self._end(outlived=False)
+            self.lost.update(self._attacked)
             return
         above = state.rho[row] > 1.0
+        self._count_attacks(set(np.flatnonzero(state.attacked[row]).tolist()), bool(above.any()))
         self._count(above, state, row)
         self._above = np.where(above, self._above + 1, 0)
         if above.any():
@@ -92,6 +101,11 @@ class CrisisWitness(Witness):
         self._now.tripped += int(tripped.sum())
         self._now.opened += int((out & ~tripped).sum())
 
+    def _count_attacks(self, now: set[int], overloaded: bool) -> None:
+        """Attacks that began in this step, and those that are still to be outlived after it."""
+        self.attacks.update(now - self._attacked)
+        self._attacked = self._attacked | now if overloaded else now
+
     def _end(self, outlived: bool) -> None:
         if self._now.length:
             self.crises.append(replace(self._now, outlived=outlived))
@@ -103,8 +117,7 @@ def crises_of(task_id: str, word: str, skip: int, months: int) -> dict[str, Any]
     task = find_task(task_id)
     name, _, heuristic = word.partition(":")
     witness = CrisisWitness(make_agent(name, task))
-    keywords = getattr(witness.agent, "env_keywords", {}) | {"split": VALIDATION, "heuristic": heuristic or None}
-    env = gymnasium.make(task.id, **keywords, disable_env_checker=True)
+    env = validation_environment(witness.agent, task, heuristic or None)
     witness.bind(env)
     survival = []
     for scenario in validation_months(task, skip, months):
@@ -129,6 +142,8 @@ def _summary(witness: CrisisWitness) -> dict[str, Any]:
         "relieved_after": {str(steps): n for steps, n in sorted(witness.relieved_after.items())},
         "opened_per_100_long_steps": round(100 * sum(each.opened for each in long) / max(steps, 1), 2),
         "tripped_per_100_long_steps": round(100 * sum(each.tripped for each in long) / max(steps, 1), 2),
+        "attacks": {str(line): n for line, n in sorted(witness.attacks.items())},
+        "attacks_lost": {str(line): n for line, n in sorted(witness.lost.items())},
     }
 
 

@@ -20,10 +20,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import numpy as np
 from gains import validation_months
-from witness import Witness
+from witness import Witness, validation_environment
 
 import rl2grid  # noqa: F401  (registers the tasks)
 from rl2grid.agents.agent import Action, Agent
@@ -32,7 +31,6 @@ from rl2grid.evaluation.agents import make_agent
 from rl2grid.evaluation.episode import play_episode
 from rl2grid.mdp.state import GridState
 from rl2grid.records.files import write_json
-from rl2grid.scenarios.splits import VALIDATION
 
 RESULTS = Path(__file__).resolve().parent / "results" / "endings.json"
 
@@ -103,7 +101,7 @@ def ends_of(task_id: str, word: str, skip: int, months: int) -> dict[str, Any]:
     task = find_task(task_id)
     name, _, heuristic = word.partition(":")
     witness = EndWitness(make_agent(name, task), tries=task.kind == "T")
-    env = gymnasium.make(task.id, split=VALIDATION, heuristic=heuristic or None, disable_env_checker=True)
+    env = validation_environment(witness.agent, task, heuristic or None)
     witness.bind(env)
     lost = []
     for scenario in validation_months(task, skip, months):

@@ -8,7 +8,9 @@ from typing import Any
 import gymnasium
 
 from rl2grid.agents.agent import Action, Agent
+from rl2grid.envs.tasks import Task
 from rl2grid.mdp.state import GridState
+from rl2grid.scenarios.splits import VALIDATION
 
 
 class Witness(ABC):
@@ -43,3 +45,9 @@ class Witness(ABC):
     def _hear_played(self, state: GridState, row: int) -> None:
         if not self.env.imagined:
             self.hear(state, row)
+
+
+def validation_environment(agent: Agent, task: Task, heuristic: str | None) -> gymnasium.Env[Any, Any]:
+    """The task on validation months, observed as the agent asks for."""
+    keywords = getattr(agent, "env_keywords", {}) | {"split": VALIDATION, "heuristic": heuristic}
+    return gymnasium.make(task.id, **keywords, disable_env_checker=True)

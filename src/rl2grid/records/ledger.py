@@ -9,6 +9,7 @@ is an entry of a leaderboard, :mod:`rl2grid.records.entries`. What the order say
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -108,7 +109,7 @@ class HashedTest:
         """Whether a policy was played; of those of the package, the ledger tells no training."""
         return bool(self.training) or "policy_hash" in self.configuration
 
-    @property
+    @functools.cached_property
     def choice(self) -> str:
         """See :func:`choice_hash`."""
         return choice_hash(self.configuration)
