@@ -16,7 +16,7 @@ from returned import assert_same, copied, put_together, with_ending
 import rl2grid  # noqa: F401 - registers the tasks
 from rl2grid.envs.vector import PowerGridVectorEnv
 from rl2grid.errors import UsageError
-from rl2grid.mdp.rewards import default_components
+from rl2grid.mdp.rewards import PRESETS, default_components
 from rl2grid.scenarios.library import list_scenarios, load_scenario
 
 TASKS = ("bus14-T0", "bus14-R", "bus118-MOB-v1-T0", "bus118-MOB-v1-R")
@@ -317,6 +317,20 @@ def test_a_reward_of_the_user_changes_rewards_only(task):
         for key in ("step", "episode_return", "discounted_reward", "illegal", "grid_steps"):
             np.testing.assert_array_equal(mine[-1][key], theirs[-1][key])
         assert [str(x) for x in mine[-1]["action_effect"]] == [str(x) for x in theirs[-1]["action_effect"]]
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_preset_pays_what_its_components_say(name):
+    """In compiled code, and in Python called after every grid step."""
+
+    def weighted(state, i):
+        return tuple(np.multiply(PRESETS[name].weights, PRESETS[name].components(state, i)))
+
+    keywords = {"heuristic": "careful", "gamma": 0.9}
+    built_in = play(make_vector("bus36-MO-v0-T0", 4, reward=name, **keywords), [1, 2, 3, 4], 25)
+    own = play(make_vector("bus36-MO-v0-T0", 4, reward=weighted, **keywords), [1, 2, 3, 4], 25)
+    for mine, theirs in zip(own[1:], built_in[1:], strict=True):
+        np.testing.assert_allclose(mine[1], theirs[1], rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("task", TASKS)

@@ -6,6 +6,9 @@ import numba
 import numpy as np
 import pytest
 
+from rl2grid.engines.native.engine import NativeEngine
+from rl2grid.engines.probes import make_probe
+from rl2grid.engines.reference.engine import ReferenceEngine
 from rl2grid.errors import UsageError
 from rl2grid.grids import GRID_IDS, load_grid
 from rl2grid.mdp.rewards import (
@@ -16,8 +19,12 @@ from rl2grid.mdp.rewards import (
     released_components,
     resolve_reward,
     reward_name,
+    trips,
+    trips_components,
 )
 from rl2grid.mdp.state import new_state
+from rl2grid.scenarios.episodes import EpisodePlan
+from rl2grid.scenarios.library import list_scenarios
 
 
 def row(state, i):
@@ -75,12 +82,22 @@ def expected_released(grid, state, i):
     return 1.0, overload, -regret / worst
 
 
+def expected_trips(grid, state, i):
+    survive, overload, cost = expected_default(grid, state, i)
+    if state.terminated[i]:
+        return survive, overload, cost
+    locked = state.time_before_cooldown_line[i] == grid.rules.reconnection
+    ours = locked & ~state.line_status[i] & ~state.attacked[i] & (state.time_next_maintenance[i] != 0)
+    return survive, overload - min(ours.sum(), 2), cost
+
+
 @pytest.mark.parametrize(
     ("components", "expected"),
     [
         (default_components, expected_default),
         (paper_components, expected_paper),
         (released_components, expected_released),
+        (trips_components, expected_trips),
     ],
 )
 def test_components_are_those_of_the_definition(grid, random_rows, components, expected):
@@ -102,7 +119,12 @@ def test_the_default_reward_is_never_negative(random_rows):
 
 def test_weights_of_the_presets():
     weights = {name: preset.weights for name, preset in PRESETS.items()}
-    assert weights == {"default": (1.0, 0.5, 0.5), "paper": (1.0, 0.5, 0.5), "released": (1.0, 1.0, 0.5)}
+    assert weights == {
+        "default": (1.0, 0.5, 0.5),
+        "paper": (1.0, 0.5, 0.5),
+        "released": (1.0, 1.0, 0.5),
+        "trips": (1.0, 0.5, 0.5),
+    }
 
 
 def test_a_calm_grid_without_losses_earns_everything(calm):
@@ -189,6 +211,60 @@ def test_an_illegal_or_ambiguous_action_is_fined_by_the_released_reward_only(cal
         getattr(state, flag)[0] = True
         assert released_components(state, 0) == (1.0, -5.0, -1.0)
         assert (default_components(state, 0), paper_components(state, 0)) == before
+
+
+def steps_of_random_play(engine, grid, episodes, steps):
+    """After every step that is no game over: how many lines the reward thinks that protections opened."""
+    probe, scenario = make_probe(grid, "topology", "random"), list_scenarios(grid.id, "bundled")[0]
+    for number in range(episodes):
+        probe.begin(np.random.default_rng(number))
+        engine.reset(0, EpisodePlan(1, number, scenario, 20 * number, steps))
+        for _ in range(steps):
+            engine.step(0, probe.choose(engine.state, 0))
+            if engine.state.terminated[0]:
+                break
+            yield trips(engine.state, 0)
+
+
+def test_trips_are_the_lines_that_grid2op_disconnects():
+    """Among lines that were switched, attacked and under maintenance."""
+    grid = load_grid("bus36-MO-v0")
+    engine = ReferenceEngine(grid, 1)
+    counted = [
+        (found, np.count_nonzero(engine.grid2op_environment(0)._disc_lines >= 0))
+        for found in steps_of_random_play(engine, grid, episodes=12, steps=60)
+    ]
+    engine.close()
+    assert all(found == expected for found, expected in counted)
+    assert sum(found for found, _ in counted) >= 3
+
+
+@pytest.mark.parametrize("grid_id", ["bus14", "bus118-M", "bus118-MOB-v1"])
+def test_trips_are_the_lines_that_protections_open(grid_id):
+    """Of grids that lock them for 10 and 12 steps."""
+    grid = load_grid(grid_id)
+    engine = NativeEngine(grid, 1)
+    counted = [
+        (found, np.count_nonzero(engine.environments.hidden.tripped[0]))
+        for found in steps_of_random_play(engine, grid, episodes=60, steps=100)
+    ]
+    assert all(found == expected for found, expected in counted)
+    assert sum(found for found, _ in counted) >= 3
+
+
+def test_a_trip_costs_half_a_step_and_more_than_two_no_more(calm):
+    state, weights = calm(load_grid("bus36-MO-v0")), PRESETS["trips"].weights
+    before = np.dot(weights, trips_components(state, 0))
+    for lines, paid in ((1, 0.5), (2, 1.0), (3, 1.0)):
+        state.line_status[0, :lines] = False
+        state.time_before_cooldown_line[0, :lines] = 12
+        out = 0.5 * lines / 59  # what every reward takes for lines out of service
+        assert np.dot(weights, trips_components(state, 0)) == pytest.approx(before - paid - out)
+    state.time_before_cooldown_line[0] = 11
+    assert trips(state, 0) == 0
+    state.time_before_cooldown_line[0] = 12
+    state.attacked[0] = True
+    assert trips(state, 0) == 0
 
 
 @pytest.mark.parametrize("grid_id", GRID_IDS)
@@ -293,6 +369,8 @@ def test_a_wrong_result_is_refused_in_one_sentence(result, calm):
     ["Default", "", None, 1.0, (1, 2), (1, 2, 3, 4), (1, 2, "3"), (1, 2, float("nan")), (True, 1, 1), {"a": 1}, "abc"],
 )
 def test_a_wrong_reward_is_refused_with_what_is_allowed(spec):
-    with pytest.raises(UsageError, match="choose one of default, paper, released, three finite weights") as error:
+    with pytest.raises(
+        UsageError, match="choose one of default, paper, released, trips, three finite weights"
+    ) as error:
         resolve_reward(spec)
     assert "\n" not in str(error.value)

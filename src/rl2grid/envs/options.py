@@ -67,9 +67,9 @@ class TaskOptions:
     would bear the loss of any line that may be lost, and no unit is dispatched; None: the agent always decides."""
     reward: str | tuple[float, float, float] | Callable[..., Any] = field(
         default="default",
-        metadata={"flag": "default, paper or released, or the weights of the three components, such as 1,0.5,0"},
+        metadata={"flag": "default, paper, released or trips, or the weights of the three components, such as 1,0.5,0"},
     )
-    """A preset (``"default"``, ``"paper"``, ``"released"``), the weights of the three default components,
+    """A preset (``"default"``, ``"paper"``, ``"released"``, ``"trips"``), the weights of the three default components,
     or a function ``(state, i) -> (survive, overload, cost)``, compiled by Numba or plain Python."""
     split: str = field(default="train", metadata=_one_of(*SPLITS))
     """Which scenarios are played: ``"train"`` (months without end), ``"validation"`` (200 months), ``"test"`` (500), or

@@ -31,6 +31,10 @@ larger than those ranges, both terms are saturated most of the time:
 - cost = -c (losses + 5 sum|actual_dispatch| + sum|storage_power|) / (5.05 c_max sum(gen_pmax)): Grid2Op's
   ``RedispReward`` divided by its largest regret; -1 at a game over and after an illegal or ambiguous action
 
+``trips`` (weights 1, 0.5, 0.5) is ``default`` for whoever is to learn to act before protections do: every line that
+they opened in the step counts once more in the overload, 1 each and at most 2. What a protection has opened is locked
+for ``reconnection`` steps, far longer than what the agent opens, and that is how it is told.
+
 A function of your own reads row ``i`` of a :class:`~rl2grid.mdp.state.GridState` after every grid step and returns the
 three components, which are added up as they are, or one number, which is the first of them. It may be plain Python, or
 compiled with ``numba.njit``, which is faster where it has loops::
@@ -55,6 +59,9 @@ from rl2grid.errors import UsageError
 from rl2grid.mdp.state import GridState
 
 _FULL_LOAD = np.float32(1.0)
+
+_MOST_TRIPS = 2
+"""Of one step that the ``trips`` reward counts."""
 
 Components = tuple[float, float, float]
 """survive, overload, cost."""
@@ -110,6 +117,28 @@ def overload_component(state: GridState, i: int) -> float:
 
 
 @jit
+def trips_components(state: GridState, i: int) -> Components:
+    """Components of the ``trips`` reward in row ``i``: 1, one in [-3, 0] and one in [-1, 0]; see the module."""
+    survive, overload, cost = default_components(state, i)
+    return survive, overload - min(trips(state, i), _MOST_TRIPS), cost
+
+
+@jit
+def trips(state: GridState, i: int) -> int:
+    """Lines that protections opened in the last grid step of row ``i``; 0 at a game over.
+
+    They are locked for all of ``reconnection`` now. So is what an agent opened where the rules lock that as long,
+    which no grid of the package does.
+    """
+    found = 0
+    for line in range(state.line_status.shape[1]):
+        if state.line_status[i, line] or state.attacked[i, line] or state.time_next_maintenance[i, line] == 0:
+            continue
+        found += state.time_before_cooldown_line[i, line] == state.reconnection[0]
+    return 0 if state.terminated[i] or state.reconnection[0] == 0 else found
+
+
+@jit
 def paper_components(state: GridState, i: int) -> Components:
     """Components of the ``paper`` reward in row ``i``: in [0, 1], [-1, 1] and [-1, 0]; see the module."""
     if state.terminated[i]:
@@ -140,6 +169,7 @@ PRESETS: dict[str, RewardFunction] = {
     "default": RewardFunction("default", default_components, (1.0, 0.5, 0.5)),
     "paper": RewardFunction("paper", paper_components, (1.0, 0.5, 0.5)),
     "released": RewardFunction("released", released_components, (1.0, 1.0, 0.5)),
+    "trips": RewardFunction("trips", trips_components, (1.0, 0.5, 0.5)),
 }
 
 

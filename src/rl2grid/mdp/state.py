@@ -60,6 +60,7 @@ class GridState(NamedTuple):
     slack_gen: Annotated[I32, constant("1", "generator that balances the flow")]
     sub_area: Annotated[I32, constant("sub", "area within which changes are limited; a line is of its origin's")]
     max_changes: Annotated[I32, constant("2", "lines and substations of an area that one action may change")]
+    reconnection: Annotated[I32, constant("1", "cooldown of a line that a protection opened", "steps")]
 
     # What Grid2Op observes after a step (its observation's attributes).
     gen_p: Annotated[F32, row("gen", "production", "MW", blank=0)]
@@ -141,6 +142,7 @@ def new_state(grid: Grid, n: int) -> GridState:
     own = {
         "slack_gen": np.array([grid.slack_gen], np.int32),
         "max_changes": np.array([grid.rules.max_line_changes, grid.rules.max_sub_changes], np.int32),
+        "reconnection": np.array([grid.rules.reconnection], np.int32),
     }
     shared = {name: getattr(grid, name) for name in fields_of(GridState, Role.CONSTANT) if name not in own}
     sizes = axis_sizes(grid) | {"component": 3, "cost": len(CONSTRAINTS), "score": 3, "operation": 7}

@@ -36,7 +36,7 @@ from rl2grid.mdp.observations import (
     write_topology_observation,
 )
 from rl2grid.mdp.operator_features import open_security
-from rl2grid.mdp.rewards import default_components, paper_components, released_components
+from rl2grid.mdp.rewards import default_components, paper_components, released_components, trips_components
 from rl2grid.mdp.security import is_secure
 from rl2grid.mdp.state import GridState
 from rl2grid.memory import take_next
@@ -44,7 +44,7 @@ from rl2grid.memory import take_next
 ALONE, IDLE, RECOVERY, RECONNECT, CAREFUL, CAREFUL_RECONNECT, SECURE, SECURE_RECONNECT = range(8)
 """Who plays between two decisions: nobody, or a heuristic (all but idle only reconnect on continuous tasks)."""
 
-DEFAULT, PAPER, RELEASED = range(3)
+DEFAULT, PAPER, RELEASED, TRIPS = range(4)
 """Rewards that are compiled in."""
 
 _NOTHING, _MOVE, _RESTORE = int(ActionKind.NOTHING), int(ActionKind.MOVE), int(ActionKind.RESTORE)
@@ -311,6 +311,8 @@ def _components(state: GridState, i: int, reward: int) -> Components:
         return paper_components(state, i)
     if reward == RELEASED:
         return released_components(state, i)
+    if reward == TRIPS:
+        return trips_components(state, i)
     return default_components(state, i)
 
 

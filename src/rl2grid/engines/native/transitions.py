@@ -27,6 +27,7 @@ from rl2grid.engines.native.advance import (
     RELEASED,
     SECURE,
     SECURE_RECONNECT,
+    TRIPS,
     advance,
     write_observations,
     write_topology_keys,
@@ -52,7 +53,7 @@ from rl2grid.mdp.actions import (
     write_mask,
 )
 from rl2grid.mdp.features import changes_topology, injects
-from rl2grid.mdp.rewards import default_components, paper_components, released_components
+from rl2grid.mdp.rewards import default_components, paper_components, released_components, trips_components
 from rl2grid.mdp.security import Security
 from rl2grid.scenarios.episodes import MAX_STEPS, EpisodePlan, PlannedStarts
 from rl2grid.structures import with_own_workspace
@@ -61,6 +62,7 @@ _COMPILED_IN: dict[Callable[..., Any], int] = {
     default_components: DEFAULT,
     paper_components: PAPER,
     released_components: RELEASED,
+    trips_components: TRIPS,
 }
 _CODES = {
     ("idle", True): IDLE,
