@@ -76,6 +76,14 @@ def test_configurations_of_one_label_and_budget_are_told_apart_by_their_hyperpar
     assert "| ppo + idle (layers 8) |" in short_ledger_table(results, TASK).replace("**", "")
 
 
+@pytest.mark.parametrize(
+    ("reward", "words"), [("default", ""), ("trips", ", reward trips"), ([1.0, 2.0, 0.5], ", reward 1,2,0.5")]
+)
+def test_another_reward_than_the_default_is_named(reward, words):
+    one = trained(1, [0.6, 0.8], env_keywords={"heuristic": "idle", "reward": reward})
+    assert one.label == f"ppo{words} + idle"
+
+
 def test_another_network_than_an_mlp_is_named():
     others = [trained(1, [0.6, 0.8], hyperparameters={"seed": 1, "network": name}) for name in ("mlp", "gnn")]
     assert [one.label for one in others] == ["ppo + idle", "ppo, gnn + idle"]

@@ -10,7 +10,7 @@ is an entry of a leaderboard, :mod:`rl2grid.records.entries`. What the order say
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -92,12 +92,14 @@ class HashedTest:
 
     @property
     def player(self) -> str:
-        """The agent, its network if no ``mlp``, features beside the paper's, and how it looks before it acts."""
+        """The agent, and what is not as usual: network, features, reward; and how it looks before it acts."""
         network = self.configuration.get("hyperparameters", {}).get("network", "mlp")
-        features = self.configuration.get("env_keywords", {}).get("operator_features")
+        keywords = self.configuration.get("env_keywords", {})
+        features, reward = keywords.get("operator_features"), keywords.get("reward", "default")
         observing = "" if features is None else f", observing {features}"
+        paid = "" if reward == "default" else f", reward {_reward_text(reward)}"
         with_network = "" if network == "mlp" else f", {network}"
-        return f"{self.agent}{with_network}{observing}{looking_of(self.configuration)}"
+        return f"{self.agent}{with_network}{observing}{paid}{looking_of(self.configuration)}"
 
     @property
     def label(self) -> str:
@@ -120,6 +122,11 @@ def agent_of(configuration: Mapping[str, Any]) -> str:
     began = configuration.get(STARTED_FROM)
     name = str(configuration.get("algorithm") or configuration["agent"])
     return name if began is None else f"{name} from {began['algorithm']}"
+
+
+def _reward_text(reward: str | Sequence[float]) -> str:
+    """A preset's name, or weights as they are typed."""
+    return reward if isinstance(reward, str) else ",".join(f"{weight:g}" for weight in reward)
 
 
 def looking_of(configuration: Mapping[str, Any]) -> str:
