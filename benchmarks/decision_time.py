@@ -83,11 +83,11 @@ def main() -> None:
         rows[name] = row_of(agent, task, heuristic, months)
         print(short_id(task.id), name, json.dumps(rows[name]), flush=True)
     results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
-    results[short_id(task.id)] = {
-        "processor": processor(),
-        "months": [arguments.skip, arguments.skip + len(months)],
-        "rows": rows,
-    }
+    measured = {"processor": processor(), "months": [arguments.skip, arguments.skip + len(months)]}
+    before = results.get(short_id(task.id), {})
+    # Rows that were measured elsewhere, or on other months, are nothing to stand beside.
+    kept = before["rows"] if before and all(before[name] == value for name, value in measured.items()) else {}
+    results[short_id(task.id)] = {**measured, "rows": {**kept, **rows}}
     write_json(RESULTS, results, indent=1)
 
 
