@@ -4,7 +4,8 @@
 [--skip N] [--top-k K] [--rehearse STEPS]`` plays the policy, the policy that looks before it acts in each of the ways
 that are asked for, and the agents beside it on N validation months after the first ``--skip``, by which the training
 picked its best policy, and writes ``src/rl2grid/algorithms/policies/NAME.pt`` and ``NAME.json``. ``rl2grid pretrained``
-shows them.
+shows them. Of what would be larger than a policy of the package may be, the critic is kept in half precision: nobody
+acts by it, and who goes on from the policy fits it anew.
 """
 
 from __future__ import annotations
@@ -13,12 +14,13 @@ import argparse
 import json
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from gains import validation_months
 
 from rl2grid.agents.agent import Agent
 from rl2grid.algorithms.checkpoint import load_checkpoint, save_checkpoint
-from rl2grid.algorithms.policy_agent import BEST_FILE, load_agent
+from rl2grid.algorithms.policy_agent import BEST_FILE, PolicyAgent
 from rl2grid.algorithms.pretrained import LARGEST, ModelCard, Survival, folder
 from rl2grid.cli.keywords import add_looking, looking
 from rl2grid.envs.tasks import Task, short_id
@@ -40,6 +42,16 @@ def played(agent: Agent, task: Task, months: tuple[str, ...], heuristic: str | N
     )
 
 
+def packed(file: Path) -> dict[str, Any]:
+    """The checkpoint, with a critic that takes half the room where it is too large."""
+    contents = load_checkpoint(file)
+    if file.stat().st_size > LARGEST:
+        weights = contents["policy"]["network"]
+        judging = {name: value.half() for name, value in weights.items() if name.startswith("critic.")}
+        contents["policy"] = {**contents["policy"], "network": {**weights, **judging}}
+    return contents
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path)
@@ -54,12 +66,12 @@ def main() -> None:
 
     args, _ = read_config(options.run)
     task, heuristic = args.task, args.env_keywords["heuristic"]
-    contents = load_checkpoint(options.run / BEST_FILE)
+    contents = packed(options.run / BEST_FILE)
     months = validation_months(task, options.skip, options.months)
-    policy = load_agent(options.run, name=f"pretrained-{options.name}")
+    policy = PolicyAgent(contents, name=f"pretrained-{options.name}")
     agents: list[Agent] = [policy]
     for way, value in looking(options).items():
-        agents.append(looking_policy(load_agent(options.run, name=policy.name), **{way: value}))
+        agents.append(looking_policy(PolicyAgent(contents, name=policy.name), **{way: value}))
     agents += [make_agent(name, task) for name in options.beside]
     card = ModelCard(
         name=options.name,
