@@ -34,6 +34,7 @@ from rl2grid.arrays import Flags
 from rl2grid.envs.tasks import find_task, short_id
 from rl2grid.evaluation.agents import make_agent
 from rl2grid.evaluation.episode import play_episode
+from rl2grid.mdp.rewards import has_tripped
 from rl2grid.mdp.state import GridState
 from rl2grid.records.files import write_json
 
@@ -96,10 +97,9 @@ class CrisisWitness(Witness):
         self.relieved_after.update(self._above[relieved].tolist())
         self.moved += int(relieved.sum()) if above.any() else 0
         out = before & ~in_service & ~state.attacked[row] & (state.time_next_maintenance[row] != 0)
-        # Protections keep a line open for longer than the rule for switching does.
-        tripped = out & (state.time_before_cooldown_line[row] > self.env.grid.rules.cooldown_line)
-        self._now.tripped += int(tripped.sum())
-        self._now.opened += int((out & ~tripped).sum())
+        tripped = sum(has_tripped(state, row, int(line)) for line in np.flatnonzero(out))
+        self._now.tripped += tripped
+        self._now.opened += int(out.sum()) - tripped
 
     def _count_attacks(self, now: set[int], overloaded: bool) -> None:
         """Attacks that began in this step, and those that are still to be outlived after it."""

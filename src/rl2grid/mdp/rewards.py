@@ -125,17 +125,25 @@ def trips_components(state: GridState, i: int) -> Components:
 
 @jit
 def trips(state: GridState, i: int) -> int:
-    """Lines that protections opened in the last grid step of row ``i``; 0 at a game over.
-
-    They are locked for all of ``reconnection`` now. So is what an agent opened where the rules lock that as long,
-    which no grid of the package does.
-    """
+    """Lines that protections opened in the last grid step of row ``i``; 0 at a game over."""
     found = 0
     for line in range(state.line_status.shape[1]):
-        if state.line_status[i, line] or state.attacked[i, line] or state.time_next_maintenance[i, line] == 0:
-            continue
-        found += state.time_before_cooldown_line[i, line] == state.reconnection[0]
-    return 0 if state.terminated[i] or state.reconnection[0] == 0 else found
+        found += has_tripped(state, i, line)
+    return found
+
+
+@jit
+def has_tripped(state: GridState, i: int, line: int) -> bool:
+    """Whether a protection opened a line in the last grid step of row ``i``; never at a game over.
+
+    It is locked for all of ``reconnection`` now. So is what an agent opened where the rules lock that as long, which no
+    grid of the package does.
+    """
+    locked_for = state.reconnection[0]
+    if state.terminated[i] or state.line_status[i, line] or locked_for == 0:
+        return False
+    by_others = state.attacked[i, line] or state.time_next_maintenance[i, line] == 0
+    return not by_others and state.time_before_cooldown_line[i, line] == locked_for
 
 
 @jit
