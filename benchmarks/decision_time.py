@@ -86,7 +86,7 @@ def main() -> None:
     measured = {"processor": processor(), "months": [arguments.skip, arguments.skip + len(months)]}
     before = results.get(short_id(task.id), {})
     # Rows that were measured elsewhere, or on other months, are nothing to stand beside.
-    kept = before["rows"] if before and all(before[name] == value for name, value in measured.items()) else {}
+    kept = before["rows"] if measured.items() <= before.items() else {}
     results[short_id(task.id)] = {**measured, "rows": {**kept, **rows}}
     write_json(RESULTS, results, indent=1)
 

@@ -24,7 +24,6 @@ import numpy as np
 from gains import validation_months
 from witness import Witness, validation_environment
 
-import rl2grid  # noqa: F401  (registers the tasks)
 from rl2grid.agents.agent import Action, Agent
 from rl2grid.envs.tasks import find_task, short_id
 from rl2grid.evaluation.agents import make_agent
