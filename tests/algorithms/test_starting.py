@@ -7,6 +7,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -18,7 +19,7 @@ from rl2grid.algorithms import imitation, ppo, sac
 from rl2grid.algorithms.checkpoint import load_checkpoint, save_checkpoint
 from rl2grid.algorithms.dqn import DQN
 from rl2grid.algorithms.on_policy import ActorCritic, divergences
-from rl2grid.algorithms.policy_agent import load_agent
+from rl2grid.algorithms.policy_agent import PolicyAgent, load_agent
 from rl2grid.algorithms.ppo import PPO
 from rl2grid.algorithms.registry import find_algorithm
 from rl2grid.algorithms.starting import read_starting_policy
@@ -71,7 +72,7 @@ def test_ppo_begins_with_exactly_the_policy_that_it_is_given(tmp_path: Path, tas
     path = trained(tmp_path / "first.pt", "ppo", task)
     mine = learner("ppo", task, start_from=path)
     mine.begin_as_asked()
-    theirs = read_starting_policy(path, None).network()
+    theirs = read_starting_policy(path).network()
     assert isinstance(theirs, ActorCritic)
     for name, tensor in theirs.state_dict().items():
         assert torch.equal(tensor, mine.network.state_dict()[name]), name
@@ -118,7 +119,7 @@ def test_what_was_imitated_is_gone_on_with(tmp_path: Path, task: str, policy: st
 
 def test_the_critic_begins_anew_where_it_would_judge_otherwise(tmp_path: Path):
     path = trained(tmp_path / "first.pt", "ppo")
-    theirs = read_starting_policy(path, None).network()
+    theirs = read_starting_policy(path).network()
     assert isinstance(theirs, ActorCritic)
     mine = learner("ppo", "bus14-T0", start_from=path, reward_scale=0.5)
     before = {name: tensor.clone() for name, tensor in mine.network.critic.state_dict().items()}
@@ -132,7 +133,7 @@ def test_dqn_goes_on_with_its_own_values(tmp_path: Path):
     mine = learner("dqn", "bus14-T0", start_from=path)
     assert isinstance(mine, DQN)
     mine.begin_as_asked()
-    theirs = read_starting_policy(path, None).network().state_dict()
+    theirs = read_starting_policy(path).network().state_dict()
     assert_same(dict(mine.network.state_dict()), dict(theirs))
     assert_same(dict(mine.target.state_dict()), dict(theirs))
 
@@ -144,6 +145,46 @@ def test_every_seed_may_begin_with_a_policy_of_its_own(tmp_path: Path):
     assert mine.identity()["start"]["path"] == str(tmp_path / "first-5.pt")
     with pytest.raises(UsageError, match="first-6"):
         learner("ppo", "bus14-T0", start_from=str(tmp_path / "first-{seed}.pt"), seed=6).begin_as_asked()
+
+
+def shortlisted(task: str, size: int | None, **changes: Any) -> Any:
+    """A learner on a task of the benchmark that chooses among the ``size`` best actions."""
+    sizes: dict[str, Any] = {"total_timesteps": 64, "num_envs": 1, "actor_layers": (8,), "critic_layers": (8,)}
+    return PPO(ppo.Args(**sizes | changes, shortlist=size), NothingToPlay(task))
+
+
+@pytest.mark.parametrize(("first", "then"), [("bus36-M-T1", "bus36-M-T0"), ("bus36-M-T0", "bus36-M-T2")])
+def test_a_policy_with_a_shortlist_plays_on_at_another_level(tmp_path: Path, first: str, then: str):
+    path = saved(tmp_path / "first.pt", shortlisted(first, 20), "ppo", first)
+    contents = {**load_checkpoint(Path(path)), "env_keywords": {"heuristic": None}}
+    save_checkpoint(Path(path), contents)
+    mine = shortlisted(then, 20, start_from=path)
+    mine.begin_as_asked()
+    played: dict[str, list[int]] = {}
+    for task, policy in ((first, contents["policy"]), (then, mine.policy_state())):
+        env = gymnasium.make(f"rl2grid/{task}-v0", split="bundled", disable_env_checker=True)
+        agent = PolicyAgent({**contents, "task": f"rl2grid/{task}-v0", "policy": policy}, deterministic=False)
+        agent.bind(env)
+        agent.seed_episode(3, 0)
+        observation, info = env.reset(seed=0)
+        played[task], over = [], False
+        while not over and len(played[task]) < 50:
+            played[task].append(int(agent.act(observation, info)))
+            observation, _, terminated, truncated, info = env.step(played[task][-1])
+            over = terminated or truncated
+        env.close()
+    assert played[first] == played[then]
+    assert len(set(played[first])) > 3
+
+
+@pytest.mark.parametrize(
+    ("first", "then", "size"),
+    [("bus14-T0", "bus14-T1", None), ("bus14-T0", "bus36-M-T0", 20), ("bus14-T0", "bus14-T1", 20)],
+)
+def test_a_policy_plays_on_in_no_other_task(tmp_path: Path, first: str, then: str, size: int | None):
+    path = saved(tmp_path / "first.pt", shortlisted(first, size), "ppo", first)
+    with pytest.raises(UsageError, match=f"it is of task rl2grid/{first}-v0, not rl2grid/{then}-v0, and only one with"):
+        shortlisted(then, size, start_from=path).begin_as_asked()
 
 
 # --- Near the teacher -----------------------------------------------------------------------------------------------
@@ -310,9 +351,7 @@ def test_a_policy_that_does_not_fit_is_refused(tmp_path: Path, algorithm: str, c
 
 def test_what_is_of_another_task_or_plays_otherwise_is_refused(tmp_path: Path):
     path = trained(tmp_path / "first.pt", "ppo")
-    with pytest.raises(UsageError, match=r"is of task 'rl2grid/bus14-T0-v0' and cannot be used for task"):
-        read_starting_policy(path, "rl2grid/bus14-R-v0")
-    start = read_starting_policy(path, None)
+    start = read_starting_policy(path)
     mine = learner("ppo", "bus14-R")
     with pytest.raises(UsageError, match="it has continuous=False actions, here are continuous=True actions"):
         mine.begin_with(start)

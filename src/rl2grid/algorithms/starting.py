@@ -6,17 +6,21 @@ A run keeps what it began with, in its checkpoint: it goes on when the file is g
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from torch import nn
 
 from rl2grid.algorithms.hyperparameters import SharedArgs
+from rl2grid.algorithms.networks import shortlist
 from rl2grid.algorithms.policy_agent import agent_of, read_policy
 from rl2grid.algorithms.registry import find_algorithm
-from rl2grid.envs.spec import Spec
+from rl2grid.envs.spec import Spec, spec_from_state
+from rl2grid.envs.tasks import find_task
 from rl2grid.errors import UsageError
+from rl2grid.mdp.actions import ActionCatalogue
 
 
 @dataclass(frozen=True)
@@ -74,8 +78,11 @@ class StartingPolicy:
             UsageError: what does not fit.
         """
         theirs, mine = self.policy["factory"]["spec"], spec.state_dict()
+        same = ("task", "action_size") if self._chooses_as_in(spec) else ()
         for name, words in _WORDS.items():
-            if theirs.get(name) != mine[name]:
+            if name not in same and theirs.get(name) != mine[name]:
+                if name == "task" and None not in (theirs["task"], spec.task):
+                    raise self.refusal(f"it is of task {theirs['task']}, not {spec.task}, {_ELSEWHERE}")
                 if name == "continuous" and theirs["task"] is not None:
                     way = "box" if theirs[name] else "discrete"
                     raise self.refusal(f"it plays joint actions otherwise: set joint_actions to {way}")
@@ -98,6 +105,27 @@ class StartingPolicy:
                 f"it was learned with heuristic {heuristic}, not {options.heuristic}: train with the former"
             )
 
+    def moved_to(self, spec: Spec) -> StartingPolicy:
+        """The same policy as one of the task of ``spec``, for which :meth:`check` has found it to fit."""
+        factory = {**self.policy["factory"], "spec": spec.state_dict()}
+        return replace(self, policy={**self.policy, "factory": factory})
+
+    def _chooses_as_in(self, spec: Spec) -> bool:
+        """Whether it chooses among actions that it has in another task of the grid as well, in the same order.
+
+        Levels of topology actions begin with those of the lower ones: a policy with a shortlist of one level is a
+        policy of every level that has its actions.
+        """
+        theirs = self.policy["factory"]["spec"]
+        size = self.policy["factory"].get("shortlist")
+        if size is None or theirs["task"] is None or spec.task is None or size > spec.action_size:
+            return False
+        a, b = find_task(theirs["task"]), find_task(spec.task)
+        if (a.grid_id, a.constraint, a.kind, b.kind) != (b.grid_id, b.constraint, "T", "T"):
+            return False
+        first, second = (_on_shortlist(each, size) for each in (spec_from_state(theirs), spec))
+        return all(np.array_equal(getattr(first, name), getattr(second, name)) for name in ("kind", "target", "mask"))
+
     def refusal(self, why: str) -> UsageError:
         """What is said where it does not fit."""
         return UsageError(f"The policy in {self.path!r} cannot be begun with: {why}.")
@@ -112,19 +140,24 @@ _WORDS = {
     "action_size": "{} actions",
 }
 """What a spec says of an environment, in words."""
+_ELSEWHERE = (
+    "and only one with a shortlist goes on in other levels of its grid, where its actions stand in the same order"
+)
 
 
-def read_starting_policy(path: str, task: str | None) -> StartingPolicy:
-    """The policy of a run folder (its best by validation, else its latest) or of a checkpoint.
+def _on_shortlist(spec: Spec, size: int) -> ActionCatalogue:
+    """What is chosen among, of a topology task with a shortlist of ``size``."""
+    assert isinstance(spec.actions, ActionCatalogue)
+    return spec.actions.take(shortlist(spec, size).astype(np.int32))
 
-    Args:
-        path: The folder or file.
-        task: Id of the task that it must be of; None: any.
+
+def read_starting_policy(path: str) -> StartingPolicy:
+    """The policy of a run folder (its best by validation, else its latest) or of a checkpoint, of whatever task.
 
     Raises:
-        UsageError: there is none, or one of another task.
+        UsageError: there is none.
     """
-    file, contents = read_policy(Path(path), task)
+    file, contents = read_policy(Path(path))
     agent = agent_of(file, contents)
     return StartingPolicy(
         path=path,

@@ -166,7 +166,7 @@ class Learner(ABC):
             UsageError: there is no policy there, or none that this learner can begin with.
         """
         if self.args.start_from is not None and self.start is None:
-            self.begin_with(read_starting_policy(self.args.with_seed(self.args.start_from), self.spec.task))
+            self.begin_with(read_starting_policy(self.args.with_seed(self.args.start_from)))
 
     def begin_with(self, start: StartingPolicy) -> None:
         """Take over the weights of a policy, and for good the statistics by which it reads observations.
@@ -175,6 +175,7 @@ class Learner(ABC):
             UsageError: this learner cannot begin with it.
         """
         start.check(self.args, self.spec, self.options)
+        start = start.moved_to(self.spec)
         self.take_over(start)
         self.start = start
         if self.normalizer is not None:
