@@ -323,6 +323,8 @@ def test_a_library_without_room_is_refused_before_anything_is_written(tmp_path: 
         ({"pupil_top_k": 3}, "pupil_top_k is of a pupil that is given by name or path"),
         ({"pupil": RandomAgent(), "pupil_top_k": 3}, "pupil_top_k is of a pupil that is given by name or path"),
         ({"pupil": "random", "pupil_top_k": 3}, "leave it out for random"),
+        ({"top_k": 3}, "top_k compares the best actions of a trained policy: leave it out for greedy"),
+        ({"rehearse": 3}, "rehearse plays the crises of a trained policy in advance: leave it out for greedy"),
         ({"pupil": "nobody"}, "Agent 'nobody' does not exist"),
         ({"pupil": "random"}, "holds no labels yet"),
         ({"split": "test"}, "Labels of the test scenarios are refused"),
@@ -369,6 +371,21 @@ def test_a_pupil_looks_before_it_acts_if_it_is_to(tmp_path: Path):
     assert [each["pupil"]["identity"].get("top_k") for each in who] == [None, 5]
     assert "pupil_top_k=5" in who[1]["command"]
     assert "pupil_top_k" not in who[0]["command"]
+
+
+def test_a_policy_that_teaches_looks_before_it_acts_if_it_is_to(tmp_path: Path):
+    said = []
+    for folder, changes in (("plain", {}), ("looking", {"top_k": 5}), ("rehearsing", {"rehearse": 6})):
+        teach("pretrained/bus14-T0-idle", "bus14-T0", output=tmp_path / folder, **changes, **SHORT)
+        said.append(json.loads((tmp_path / folder / LABELS_FILE).read_text()))
+    assert [each["teacher_identity"].get("top_k") for each in said] == [None, 5, None]
+    assert [each["teacher_identity"].get("rehearse") for each in said] == [None, None, 6]
+    assert "top_k=5" in said[1]["rounds"][0]["command"]
+    with pytest.raises(UsageError, match="different teacher"):
+        teach("pretrained/bus14-T0-idle", "bus14-T0", output=tmp_path / "plain", top_k=5, **SHORT)
+    with pytest.raises(UsageError, match="top_k and rehearse are of a teacher that is given by name or path"):
+        teach(RandomAgent(), "bus14-T0", output=tmp_path / "own", top_k=5, **SHORT)
+    assert not (tmp_path / "own").exists()
 
 
 def test_a_pupil_of_other_environments_is_refused(tmp_path: Path):

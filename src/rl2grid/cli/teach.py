@@ -38,6 +38,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         default=None,
         help="actions of the pupil that the what-if compares when it acts; by default it plays its best",
     )
+    keywords.add_looking(parser, "; of the teacher")
     parser.add_argument(
         "--gamma",
         type=float,
@@ -67,6 +68,8 @@ def _run(options: argparse.Namespace, output: Output) -> int:
         pupil=options.pupil,
         pupil_share=options.pupil_share,
         pupil_top_k=options.pupil_top_k,
+        top_k=options.top_k,
+        rehearse=options.rehearse,
         gamma=options.gamma,
         thin=options.thin,
         workers=options.workers,
@@ -83,6 +86,7 @@ def _run(options: argparse.Namespace, output: Output) -> int:
             gamma=options.gamma,
             thin=options.thin,
             output=options.output,
+            looking=keywords.looking(options),
         ),
         **chosen,
     )

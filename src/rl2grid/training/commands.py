@@ -62,6 +62,7 @@ def teach_command(
     thin: float,
     output: Path | None,
     pupil_top_k: int | None = None,
+    looking: Mapping[str, int] | None = None,
 ) -> str:
     """The ``rl2grid teach`` that labels a round, or goes on with it, whatever is the default then.
 
@@ -74,11 +75,12 @@ def teach_command(
         pupil: who plays; None: the teacher.
         pupil_share: how often.
         pupil_top_k: actions of it that are compared; None: it plays its best.
+        looking: how a policy that teaches looks before it acts; None: it does not.
         gamma: the discount; None: the usual one.
         thin: one is kept of so many safe states in which nothing is done.
         output: the folder; None: the usual one.
     """
-    words = ["rl2grid", "teach", teacher, short_id(task.id), "--months", str(months)]
+    words = ["rl2grid", "teach", teacher, short_id(task.id), *flags(looking or {}), "--months", str(months)]
     words += ["--seed", str(seed)] if seed else []
     words += [] if pupil is None else ["--pupil", str(pupil), "--pupil-share", f"{pupil_share:g}"]
     words += [] if pupil_top_k is None else ["--pupil-top-k", str(pupil_top_k)]

@@ -20,7 +20,7 @@ from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import make_agent
 from rl2grid.evaluation.crew import BoundAgent, Job, OnProgress, Setting, make_crew
-from rl2grid.evaluation.flags import environment_flags
+from rl2grid.evaluation.flags import environment_flags, flags
 from rl2grid.evaluation.places import default_folder
 from rl2grid.evaluation.progress import show_progress, watch_making
 from rl2grid.evaluation.protocol import AS_TRAINED, env_keywords
@@ -118,6 +118,8 @@ def teach(
     pupil: str | Path | Agent | None = None,
     pupil_share: float = PUPIL_SHARE,
     pupil_top_k: int | None = None,
+    top_k: int | None = None,
+    rehearse: int | None = None,
     gamma: float | None = None,
     thin: float = THIN,
     workers: int | None = None,
@@ -139,6 +141,8 @@ def teach(
             None: the teacher acts.
         pupil_share: probability with which the pupil acts in a decision, else the teacher.
         pupil_top_k: actions that the what-if compares when a pupil given by name or path acts; None: it plays its best.
+        top_k: actions that the what-if compares where a policy given by name or path teaches; None: it plays its best.
+        rehearse: grid steps of a crisis that such a policy plays in imagined worlds first; None: none are.
         gamma: discount of a grid step in rewards and returns; None: :data:`DISCOUNTS`.
         thin: of so many decisions in which the grid is safe and the teacher does nothing, one is kept, at random.
         workers: processes that play at the same time; 0: this process plays; None: one per processor core, but this one
@@ -151,7 +155,12 @@ def teach(
         UsageError: the request cannot be met, or ``output`` holds other labels. Nothing was written.
     """
     task = find_task(task)
-    chosen = make_agent(teacher, task) if isinstance(teacher, str | Path) else teacher
+    looking = {name: value for name, value in (("top_k", top_k), ("rehearse", rehearse)) if value is not None}
+    if looking and not isinstance(teacher, str | Path):
+        raise UsageError(
+            "top_k and rehearse are of a teacher that is given by name or path: name it, or leave them out."
+        )
+    chosen = make_agent(teacher, task, **looking) if isinstance(teacher, str | Path) else teacher
     if pupil_top_k is not None and not isinstance(pupil, str | Path):
         raise UsageError("pupil_top_k is of a pupil that is given by name or path: name it, or leave this out.")
     learner = make_agent(pupil, task, top_k=pupil_top_k) if isinstance(pupil, str | Path) else pupil
@@ -175,14 +184,16 @@ def teach(
         chosen,
         task,
         "labels",
-        _folder_name(keywords, seed),
+        _folder_name(keywords, seed, looking),
     )
     check_folder(folder)
     # What cannot be played, or whose months have no room, is refused before anything is written.
     copy.deepcopy(setup).player().close()
     check_training_room(task.grid_id, months)
     watch_making(task.grid_id, *make_scenarios(task.grid_id, [_job(task, seed, 0, 0).scenario]), False)
-    call = command or _call(teacher, task, keywords, months, seed, pupil, pupil_share, pupil_top_k, gamma, thin, folder)
+    call = command or _call(
+        teacher, task, keywords, months, seed, pupil, pupil_share, pupil_top_k, looking, gamma, thin, folder
+    )
     with open_labels(folder, _request(setup, seed), _round(setup, months, call)) as labels:
         named = all(isinstance(each, str | Path | None) for each in (teacher, pupil))
         rows = _label(setup, labels, seed, _number_of_workers(workers, named), progress)
@@ -330,10 +341,10 @@ def _round(setup: LabelSetup, months: int, command: str) -> dict[str, Any]:
     }
 
 
-def _folder_name(keywords: Mapping[str, Any], seed: int) -> str:
+def _folder_name(keywords: Mapping[str, Any], seed: int, looking: Mapping[str, int]) -> str:
     """What tells labels of the same teacher apart."""
-    flags = environment_flags({**keywords, "heuristic": None})
-    words = [keywords["heuristic"] or "", *(flag.removeprefix("--") for flag in flags)]
+    chosen = [*environment_flags({**keywords, "heuristic": None}), *flags(looking)]
+    words = [keywords["heuristic"] or "", *(flag.removeprefix("--") for flag in chosen)]
     return "-".join(filter(None, (f"seed-{seed}", *words)))
 
 
@@ -346,12 +357,13 @@ def _call(
     pupil: str | Path | Agent | None,
     pupil_share: float,
     pupil_top_k: int | None,
+    looking: Mapping[str, int],
     gamma: float,
     thin: float,
     folder: Path,
 ) -> str:
     arguments: dict[str, Any] = {"months": months, "seed": seed, "gamma": gamma, "thin": thin}
-    arguments |= changed_options(keywords)
+    arguments |= {**changed_options(keywords), **looking}
     if pupil is not None:
         arguments |= {"pupil": _shown(pupil), "pupil_share": pupil_share}
     if pupil_top_k is not None:
