@@ -282,6 +282,25 @@ def test_layers_may_be_exchanged_and_of_other_kinds():
     torch.testing.assert_close(layers(inputs.view(2, 3, 3)), layers(inputs).view(2, 3, 2))
 
 
+@pytest.mark.parametrize("batch", [1, 3, 70])
+def test_frozen_layers_give_the_same_bits_and_learn_no_more(batch: int):
+    layers = Layers(nn.Linear(37, 40), nn.Tanh(), nn.Linear(40, 65), nn.ReLU(), nn.Linear(65, 3))
+    inputs = torch.randn(batch, 37)
+    with torch.no_grad():
+        before = layers(inputs)
+        mlp.freeze(nn.ModuleList([nn.Identity(), layers]))
+        assert torch.equal(layers(inputs), before)
+        assert torch.equal(layers(inputs.unsqueeze(1)), before.unsqueeze(1))
+        assert torch.equal(layers(torch.cat([inputs, inputs], dim=1)[:, :37]), before)
+        layers[0].weight.zero_()
+        assert torch.equal(layers(inputs), before)
+    mixed = Layers(nn.Linear(3, 4), nn.GELU())
+    expected = mixed(torch.ones(1, 3))
+    mixed.freeze()
+    with torch.no_grad():
+        assert torch.equal(mixed(torch.ones(1, 3)), expected)
+
+
 def test_second_derivatives_are_refused():
     inputs = torch.randn(6, 3, requires_grad=True)
     layers = Layers(nn.Linear(3, 4), nn.Tanh(), nn.Linear(4, 1))

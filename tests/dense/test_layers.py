@@ -12,9 +12,12 @@ from rl2grid.dense.layers import (
     LINEAR,
     RELU,
     TANH,
+    n_panels,
     undo_activation,
     write_input_gradients,
     write_layer,
+    write_layer_of_panels,
+    write_panels,
     write_weight_gradients,
 )
 from rl2grid.dense.tiles import COLUMNS, ROWS
@@ -70,6 +73,18 @@ def test_a_row_is_the_same_in_any_batch():
     together = layer_of(inputs, weight, bias, TANH)
     for size in (1, ROWS - 1, COLUMNS, COLUMNS + 1):
         assert np.array_equal(layer_of(inputs[:size], weight, bias, TANH), together[:size])
+
+
+@pytest.mark.parametrize("activation", FUNCTIONS)
+@pytest.mark.parametrize("shape", SHAPES)
+def test_panels_of_a_weight_give_the_same_bits(shape, activation):
+    batch, n_inputs, n_outputs = shape
+    inputs, weight, bias = numbers(batch, n_inputs), numbers(n_outputs, n_inputs, seed=1), numbers(n_outputs, seed=2)
+    panels = np.full((n_panels(n_outputs), n_inputs, COLUMNS), np.nan, np.float32)
+    write_panels(weight, panels)
+    outputs = np.full((batch, n_outputs), np.nan, np.float32)
+    write_layer_of_panels(inputs, panels, bias, activation, outputs)
+    assert np.array_equal(outputs, layer_of(inputs, weight, bias, activation))
 
 
 def test_an_output_is_the_same_beside_any_others():

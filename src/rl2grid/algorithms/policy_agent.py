@@ -15,6 +15,7 @@ import torch
 
 from rl2grid.agents.agent import Action, Considered, Info, Observation
 from rl2grid.algorithms.checkpoint import load_checkpoint
+from rl2grid.algorithms.networks.mlp import freeze
 from rl2grid.algorithms.pretrained import PREFIX, is_pretrained, pretrained
 from rl2grid.algorithms.registry import find_algorithm
 from rl2grid.envs.joint import JointAsBox, JointAsDiscrete
@@ -61,6 +62,7 @@ class PolicyAgent:
         ``heuristic``, unless the difference is what is studied."""
         self.deterministic = deterministic
         self._network = find_algorithm(contents["algorithm"]).load_policy(policy)
+        freeze(self._network)
         self._mask_actions = bool(policy["mask_actions"])
         self._normalizer: ObservationNormalizer | None = None
         if policy["normalizer"] is not None:

@@ -39,6 +39,32 @@ def write_layer(inputs: F32, weight: F32, bias: F32, activation: int, outputs: F
 
 
 @jit
+def write_panels(weight: F32, panels: F32) -> None:
+    """Write a weight as tiles read it, so that :func:`write_layer_of_panels` need not turn it for every batch.
+
+    Args:
+        weight: [output, input].
+        panels: [:func:`n_panels`, input, COLUMNS] is written, with zeros where there are no more outputs.
+    """
+    for k in range(panels.shape[0]):
+        _transpose_rows(weight, k * COLUMNS, panels[k])
+
+
+def n_panels(n_outputs: int) -> int:
+    """Panels of a weight of so many outputs."""
+    return -(-n_outputs // COLUMNS)
+
+
+@jit
+def write_layer_of_panels(inputs: F32, panels: F32, bias: F32, activation: int, outputs: F32) -> None:
+    """Write what a layer gives, to the same bits as :func:`write_layer` does, of panels for its weight."""
+    tile = np.empty((ROWS, COLUMNS), np.float32)
+    for k in range(panels.shape[0]):
+        _write_block(inputs, panels[k], bias, k * COLUMNS, tile, outputs)
+    _activate(outputs, activation)
+
+
+@jit
 def write_weight_gradients(gradients: F32, inputs: F32, weight: F32, bias: F32) -> None:
     """Write the gradients of a layer's weights.
 
@@ -127,18 +153,23 @@ def _write_few(inputs: F32, weight: F32, bias: F32, outputs: F32) -> None:
 @jit
 def _write_many(inputs: F32, weight: F32, bias: F32, outputs: F32) -> None:
     """A layer, before its activation; rows of a tile are inputs."""
-    n_rows, n_inputs = inputs.shape
-    n_outputs = weight.shape[0]
-    panel, tile = np.empty((n_inputs, COLUMNS), np.float32), np.empty((ROWS, COLUMNS), np.float32)
-    for output in range(0, n_outputs, COLUMNS):
+    panel, tile = np.empty((inputs.shape[1], COLUMNS), np.float32), np.empty((ROWS, COLUMNS), np.float32)
+    for output in range(0, weight.shape[0], COLUMNS):
         _transpose_rows(weight, output, panel)
-        columns = min(COLUMNS, n_outputs - output)
-        for row in range(0, n_rows, ROWS):
-            n = min(ROWS, n_rows - row)
-            write_tile(n, inputs, row * n_inputs, n_inputs, 1, panel, n_inputs, tile)
-            for i in range(n):
-                for j in range(columns):
-                    outputs[row + i, output + j] = tile[i, j] + bias[output + j]
+        _write_block(inputs, panel, bias, output, tile, outputs)
+
+
+@borrowing_jit
+def _write_block(inputs: F32, panel: F32, bias: F32, output: int, tile: F32, outputs: F32) -> None:
+    """What a layer gives before its activation, of the outputs from ``output`` on that a panel has."""
+    n_rows, n_inputs = inputs.shape
+    columns = min(COLUMNS, outputs.shape[1] - output)
+    for row in range(0, n_rows, ROWS):
+        n = min(ROWS, n_rows - row)
+        write_tile(n, inputs, row * n_inputs, n_inputs, 1, panel, n_inputs, tile)
+        for i in range(n):
+            for j in range(columns):
+                outputs[row + i, output + j] = tile[i, j] + bias[output + j]
 
 
 @borrowing_jit

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -12,16 +12,20 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from rl2grid.algorithms.networks import Network, Request, Style
-from rl2grid.arrays import I64
+from rl2grid.arrays import F32, I64
 from rl2grid.dense.layers import (
     LINEAR,
     RELU,
     TANH,
+    n_panels,
     undo_activation,
     write_input_gradients,
     write_layer,
+    write_layer_of_panels,
+    write_panels,
     write_weight_gradients,
 )
+from rl2grid.dense.tiles import COLUMNS
 
 _ACTIVATIONS: dict[type[Any], int] = {nn.ReLU: RELU, nn.Tanh: TANH}
 
@@ -30,11 +34,21 @@ class Layers(nn.Sequential):
     """Layers one after the other: where there is compiled code for them, with that (:mod:`rl2grid.dense`).
 
     There is for float32 on a processor, linear layers, ReLU and tanh. What comes out is the same bit by bit whatever
-    the batch, the threads and the processor.
+    the batch, the threads and the processor, and whether or not they are frozen.
     """
+
+    _frozen: Sequence[_FrozenLayer] = ()
+
+    def freeze(self) -> None:
+        """Keep a copy of all weights, which no longer change, as single observations are read fastest."""
+        weights, activations = _weights_and_activations(self._modules.values())
+        layers = zip(weights[::2], weights[1::2], activations, strict=True)
+        self._frozen = tuple(_frozen_layer(*layer) for layer in layers)
 
     def forward(self, inputs: Tensor) -> Tensor:
         """Numbers [..., inputs] -> [..., width]."""
+        if self._frozen and not torch.is_grad_enabled() and inputs.dtype == torch.float32:
+            return _outputs_of_frozen(_rows(inputs), self._frozen).view(*inputs.shape[:-1], -1)
         weights, activations = _weights_and_activations(self._modules.values())
         if not weights or inputs.device.type != "cpu" or inputs.dtype != torch.float32:
             outputs: Tensor = super().forward(inputs)  # type: ignore[no-untyped-call]
@@ -89,6 +103,30 @@ def _outputs(inputs: Tensor, activations: Sequence[int], weights: Sequence[Tenso
     return outputs
 
 
+class _FrozenLayer(NamedTuple):
+    """Weights of a layer as :func:`rl2grid.dense.layers.write_layer_of_panels` takes them."""
+
+    panels: F32
+    bias: F32
+    activation: int
+
+
+def _frozen_layer(weight: Tensor, bias: Tensor, activation: int) -> _FrozenLayer:
+    panels = np.empty((n_panels(len(weight)), weight.shape[1], COLUMNS), np.float32)
+    write_panels(weight.detach().numpy(), panels)
+    return _FrozenLayer(panels, bias.detach().numpy().copy(), activation)
+
+
+def _outputs_of_frozen(inputs: Tensor, layers: Sequence[_FrozenLayer]) -> Tensor:
+    """What the last layer gives, [batch, width]."""
+    given: F32 = inputs.numpy()
+    for layer in layers:
+        outputs = np.empty((len(given), len(layer.bias)), np.float32)
+        write_layer_of_panels(given, layer.panels, layer.bias, layer.activation, outputs)
+        given = outputs
+    return torch.from_numpy(given)
+
+
 class _Dense(torch.autograd.Function):
     """Layers, with their gradients."""
 
@@ -141,6 +179,13 @@ def stacked(widths: Sequence[int], style: Style, generator: torch.Generator | No
         layer = style.linear(inputs, outputs, last=last, generator=generator)
         modules += [layer] if last else [layer, style.activation()]
     return Layers(*modules)
+
+
+def freeze(network: nn.Module) -> None:
+    """Freeze all :class:`Layers` of a network that learns no more."""
+    for module in network.modules():
+        if isinstance(module, Layers):
+            module.freeze()
 
 
 NETWORK = Network("mlp", build)
