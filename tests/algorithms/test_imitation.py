@@ -13,22 +13,19 @@ import torch
 from labelled_toys import NothingToPlay, write
 from sample_labels import write_made_up_labels
 
+from rl2grid.algorithms.examples import Batch, factor_of_acting, held_out, weighted_statistics
 from rl2grid.algorithms.imitation import (
     ALGORITHM,
     Args,
-    Batch,
     Imitation,
     aims,
     cross_entropies,
     deviation_losses,
-    factor_of_acting,
     gumbel_log_std,
-    held_out,
     huber,
     load_policy,
     preset,
     said_by,
-    weighted_statistics,
 )
 from rl2grid.algorithms.on_policy import ActorCritic
 from rl2grid.algorithms.registry import find_algorithm
