@@ -124,6 +124,8 @@ class StartingPolicy:
         if (a.grid_id, a.constraint, a.kind, b.kind) != (b.grid_id, b.constraint, "T", "T"):
             return False
         first, second = (_on_shortlist(each, size) for each in (spec_from_state(theirs), spec))
+        if first is None or second is None:
+            return False
         return all(np.array_equal(getattr(first, name), getattr(second, name)) for name in ("kind", "target", "mask"))
 
     def refusal(self, why: str) -> UsageError:
@@ -145,9 +147,10 @@ _ELSEWHERE = (
 )
 
 
-def _on_shortlist(spec: Spec, size: int) -> ActionCatalogue:
-    """What is chosen among, of a topology task with a shortlist of ``size``."""
-    assert isinstance(spec.actions, ActionCatalogue)
+def _on_shortlist(spec: Spec, size: int) -> ActionCatalogue | None:
+    """What is chosen among, of a topology task with a shortlist of ``size``; None: its actions are not the task's."""
+    if not isinstance(spec.actions, ActionCatalogue):
+        return None
     return spec.actions.take(shortlist(spec, size).astype(np.int32))
 
 
