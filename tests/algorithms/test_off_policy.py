@@ -367,18 +367,14 @@ def _learned_in_turn(kind: str) -> dict[str, Any]:
 
 
 @ALL
-@pytest.mark.parametrize(
-    ("in_files", "lag", "stops"),
-    [(False, 0, (1, 3, 5)), (True, 0, (1, 5)), (True, 1, (3,))],
-    ids=["state", "files", "lag"],
-)
+@pytest.mark.parametrize(("in_files", "lag"), [(False, 0), (True, 0), (True, 1)], ids=["state", "files", "lag"])
 def test_a_resumed_run_ends_with_the_weights_of_one_that_was_not_interrupted(
-    kind: str, in_files: bool, lag: int, stops: tuple[int, ...], tmp_path: Path
+    kind: str, in_files: bool, lag: int, tmp_path: Path
 ):
     changes = {"buffer_size": 150, "last_learning_rate_share": 0.1, "lag": lag}  # forgets on the way
     straight = trainer(kind, **changes)
     metrics = [straight.iterate() for _ in range(straight.num_iterations)][-1]
-    for stop in stops:
+    for stop in (1, 3, 5):
         begun = trainer(kind, **changes)
         if in_files:
             begun.store_in(tmp_path / f"replay{stop}")
