@@ -62,7 +62,6 @@ class PolicyAgent:
         ``heuristic``, unless the difference is what is studied."""
         self.deterministic = deterministic
         self._network = find_algorithm(contents["algorithm"]).load_policy(policy)
-        freeze(self._network)
         self._mask_actions = bool(policy["mask_actions"])
         self._normalizer: ObservationNormalizer | None = None
         if policy["normalizer"] is not None:
@@ -109,6 +108,7 @@ class PolicyAgent:
                 f"{self._network.action_size} actions, but the environment has {size} and {actions}: "
                 "the definition of the task has changed since it was trained."
             )
+        freeze(self._network)  # here: who reads a policy for its hash, or hands it to other processes, plays nothing
 
     def reset(self, i: int) -> None:
         """Nothing to forget."""
