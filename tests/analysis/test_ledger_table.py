@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from sample_ledger import MONTHS, ledger, trained, untrained
+from sample_ledger import MONTHS, ledger, on, trained, untrained
 from sample_results import TASK, result
 
 from rl2grid.analysis.ledger_figure import draw_ledger
@@ -112,6 +112,18 @@ def test_what_later_rules_of_an_agent_replaced_is_marked_and_left_out_of_short_t
     (axes,) = draw_ledger(results, TASK).axes
     assert len(axes.get_yticklabels()) == 2
     assert "**0.700** (2 months)" in overview_table(results)
+
+
+def test_a_constrained_task_is_told_by_its_own_cost():
+    task = "rl2grid/bus14-T0-LSI-v0"
+    safer = on(task, trained(1, [0.6, 1.0]))
+    longer = on(task, trained(2, [0.9, 0.9], algorithm="dqn"))
+    table = short_ledger_table(ledger(longer, safer), task)
+    assert "**ppo + idle**" in table
+    row = cells(table.replace("**", ""), "ppo")
+    assert row["cost LSI"] == "0.5"
+    assert row["LSI safe"].startswith("50% [")
+    assert "TLO" not in "".join(row)
 
 
 def test_an_unknown_reference_is_refused():

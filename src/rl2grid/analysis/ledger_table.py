@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from rl2grid.analysis.table import difference_cell, markdown_row, p_cell, share_text, with_interval
-from rl2grid.envs.tasks import short_id
+from rl2grid.envs.tasks import find_task, short_id
 from rl2grid.errors import one_of
 from rl2grid.mdp.constraint_table import CONSTRAINTS, THRESHOLDS
 from rl2grid.records.comparisons import Difference, holm, paired_differences
@@ -122,6 +122,9 @@ def ledger_table(results: Mapping[str, HashedTest], task: str | None = None, ref
 def short_ledger_table(results: Mapping[str, HashedTest], task: str) -> str:
     """The results of one task in few columns, as Markdown: the best first, which is bold.
 
+    The best survives longest; under a constraint it has most safe months, and of equals the longest survival. A
+    constrained task shows its own cost and safe months, others the safe months in the sense of TLO.
+
     Args:
         results: of a ledger.
         task: id of the task.
@@ -129,8 +132,16 @@ def short_ledger_table(results: Mapping[str, HashedTest], task: str) -> str:
     rows = present_rows(results, task)
     compared = _compared(rows, REFERENCE)
     heading = f"to {REFERENCE}"
-    ranked = sorted(enumerate(rows), key=lambda one: -float(one[1].scores("survival").values.mean()))
-    columns: dict[str, list[str]] = {name: [] for name in ("agent", "survival", heading, "completed", "TLO safe")}
+    limit = find_task(task).constraint
+
+    def merits(row: LedgerRow) -> tuple[float, ...]:
+        scores = (*((row.safe(limit),) if limit else ()), row.scores("survival"))
+        return tuple(float(one.values.mean()) for one in scores)
+
+    ranked = sorted(enumerate(rows), key=lambda one: merits(one[1]), reverse=True)
+    counted = limit or "TLO"
+    names = ("agent", "survival", heading, "completed", f"cost {limit}", f"{counted} safe")
+    columns: dict[str, list[str]] = {name: [] for name in names}
     for place, (number, row) in enumerate(ranked):
         survival = with_interval(estimate(row.scores("survival")), 3)
         difference = compared.get(number)
@@ -139,7 +150,8 @@ def short_ledger_table(results: Mapping[str, HashedTest], task: str) -> str:
             f"**{survival}**" if place == 0 else survival,
             difference_cell(difference).text if isinstance(difference, Difference) else difference or "",
             share_text(estimate(row.scores("completed"))),
-            share_text(estimate(row.safe("TLO"))),
+            "" if limit is None else f"{estimate(row.scores(CONSTRAINTS[limit].column)).value:,.1f}",
+            share_text(estimate(row.safe(counted))),
         )
         for column, cell in zip(columns.values(), cells, strict=True):
             column.append(cell)
