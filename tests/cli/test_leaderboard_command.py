@@ -92,6 +92,7 @@ def test_entries_are_ranked_by_survival(folder, capsys, monkeypatch):
         (["table", "--ledger", "{}/random.json", "--learned", "--best"], "--best and --learned are different tables"),
         (["table", "{}/random.json", "--untrained"], "--untrained is for the rows of a --ledger"),
         (["table", "--ledger", "{}/random.json", "--untrained", "--to", "greedy"], "leave out --task and --to"),
+        (["table", "{}/random.json", "--heuristics"], "--heuristics is for the rows of a --ledger"),
         (["table", "{}/random.json", "--ledger", "{}/ledger.json"], "do not belong into one table"),
         (["table", "--ledger", "{}/ledger.json", "--l2rpn"], "a ledger does not keep what its episodes cost"),
         (["table", "--ledger", "{}/ledger.json"], "There is no ledger"),

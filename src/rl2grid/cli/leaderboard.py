@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from rl2grid.records.evaluations import Evaluation
 
 _SUBJECT = "a run folder, pretrained/NAME, or an agent without training as greedy@bus14-T0 or random@bus14-T0:idle"
-_OF_ALL_TASKS = "best", "learned", "untrained"
+_OF_ALL_TASKS = "best", "learned", "untrained", "heuristics"
 """Flags of the tables of a ledger that have a row per task."""
 DIFFERENT = 1
 """Exit status when an entry is not what its actions make."""
@@ -86,6 +86,9 @@ def _add_table(actions: Any) -> None:
     )
     parser.add_argument(
         "--untrained", action="store_true", help="of a ledger: doing nothing, search and plans, a row per task"
+    )
+    parser.add_argument(
+        "--heuristics", action="store_true", help="of a ledger: heuristics side by side, a row per task and agent"
     )
     add_scores_flag(parser)
     parser.set_defaults(run=_table)
@@ -196,6 +199,7 @@ def _check_what_is_ranked(options: argparse.Namespace) -> None:
 
 
 def _ledger_text(options: argparse.Namespace, tests: Mapping[str, HashedTest]) -> str:
+    from rl2grid.analysis.ledger_heuristics import heuristic_table
     from rl2grid.analysis.ledger_learned import learned_table
     from rl2grid.analysis.ledger_overview import overview_table
     from rl2grid.analysis.ledger_table import ledger_table
@@ -207,6 +211,8 @@ def _ledger_text(options: argparse.Namespace, tests: Mapping[str, HashedTest]) -
         return learned_table(tests)
     if options.untrained:
         return untrained_table(tests)
+    if options.heuristics:
+        return heuristic_table(tests)
     return ledger_table(tests, None if options.only is None else find_task(options.only).id, options.to)
 
 
