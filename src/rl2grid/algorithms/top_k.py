@@ -14,13 +14,17 @@ from rl2grid.arrays import F64
 from rl2grid.errors import UsageError
 from rl2grid.mdp.heuristics import SAFE_RHO
 
+FEW = 4
+"""Candidates that the first question is about: where a grid can be made safe, one of them mostly does it."""
+
 
 class TopK:
     """Plays the first of a policy's ``k`` best legal actions that the forecast calls safe.
 
     Safe is what leaves every line below 95% in the next step. Where none of them does, the one with the least worst
-    loading is played. With ``k`` = 1 it is the policy. A topology task on the native engine asks one what-if for all
-    ``k`` (:meth:`PowerGridEnv.what_if`), others one ``simulate`` each.
+    loading is played. With ``k`` = 1 it is the policy. A topology task on the native engine asks a what-if about the
+    best :data:`FEW` (:meth:`PowerGridEnv.what_if`) and, where none of them is safe, another about all others; other
+    tasks ask one ``simulate`` after the other until one is.
 
     Continuous actions have no best few: the candidates are the most probable one and, where the forecast does not call
     that safe, ``k`` - 1 around it, :data:`~rl2grid.algorithms.policy_agent.WIDTH` times as far away as the policy
@@ -69,10 +73,8 @@ class TopK:
         if self._policy.continuous:
             return self._drawn(observation, info)
         candidates, preferences = self._policy.best(observation, self._k)
-        loading = self._loading(candidates) if len(candidates) > 1 else np.zeros(1)
-        safe = np.flatnonzero(loading < SAFE_RHO)
-        chosen = int(safe[0]) if len(safe) else int(loading.argmin())
-        self._considered = Considered(self._policy.preference, candidates, preferences, _why(chosen, len(safe) > 0))
+        chosen, is_safe = self._choice(candidates)
+        self._considered = Considered(self._policy.preference, candidates, preferences, _why(chosen, is_safe))
         return candidates[chosen]
 
     def proposals(self, observation: Observation, info: Info) -> list[Action]:
@@ -102,6 +104,24 @@ class TopK:
         tried, values = [candidates[k] for k in order], [loading[k] for k in order]
         self._considered = Considered("worst loading", tried, values, _why(chosen, loading[chosen] < SAFE_RHO))
         return candidates[chosen]
+
+    def _choice(self, candidates: list[Action]) -> tuple[int, bool]:
+        """The place of the one to play, and whether the forecast calls it safe; one alone is not looked at."""
+        if len(candidates) == 1:
+            return 0, True
+        loading = np.zeros(0)
+        for part in self._parts(candidates):
+            loading = np.concatenate((loading, self._loading(part)))
+            safe = np.flatnonzero(loading < SAFE_RHO)
+            if len(safe):
+                return int(safe[0]), True
+        return int(loading.argmin()), False
+
+    def _parts(self, candidates: list[Action]) -> list[list[Action]]:
+        """Candidates that are looked at together, one part after the other: behind a safe one nobody looks."""
+        if not self._asks_at_once:
+            return [[candidate] for candidate in candidates]
+        return [part for part in (candidates[:FEW], candidates[FEW:]) if part]
 
     def _loading(self, candidates: list[Action]) -> F64:
         """The worst loading in the next step after each, by the forecast; infinite where the game would be lost."""
