@@ -2,8 +2,8 @@
 
 Pages name the tasks, with ``<!-- results: bus14-T0 -->``, or with ``<!-- figure: bus14-T0 -->`` for the figure alone;
 ``<!-- overview -->`` is the table of all tasks, ``<!-- learned -->`` that of methods trained with several seeds,
-``<!-- untrained -->`` that of who learns nothing, ``<!-- bounds -->`` what those survive who know what comes, beside
-who does not.
+``<!-- untrained -->`` that of who learns nothing, ``<!-- heuristics -->`` agents by heuristic, ``<!-- bounds -->`` what
+those survive who know what comes, beside who does not.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from pictures import add_picture, picture_markdown
 
 from rl2grid.analysis.ledger_bounds import headroom_table
 from rl2grid.analysis.ledger_figure import draw_ledger
+from rl2grid.analysis.ledger_heuristics import heuristic_table
 from rl2grid.analysis.ledger_learned import learned_table
 from rl2grid.analysis.ledger_overview import overview_table
 from rl2grid.analysis.ledger_table import short_ledger_table
@@ -29,11 +30,15 @@ from rl2grid.envs.tasks import find_task
 from rl2grid.records.ledger import HashedTest, read_ledger
 
 RESULTS = Path(__file__).resolve().parents[2] / "benchmarks" / "results"
-LEDGER, BOUNDS, TIMES = (RESULTS / f"{name}.json" for name in ("baselines", "bounds", "decision_time"))
-PAGES = ("results.md", "index.md")
+BASELINES, PAPER, BOUNDS, TIMES = (
+    RESULTS / f"{name}.json" for name in ("baselines", "paper", "bounds", "decision_time")
+)
+LEDGERS = {"results.md": BASELINES, "index.md": BASELINES, "paper.md": PAPER}
+"""Of each page."""
 _TABLES = {
     "<!-- overview -->": overview_table,
     "<!-- learned -->": learned_table,
+    "<!-- heuristics -->": heuristic_table,
     "<!-- untrained -->": lambda results: untrained_table(results, _milliseconds()),
     "<!-- bounds -->": lambda results: headroom_table(results, read_ledger(BOUNDS)),
 }
@@ -42,28 +47,34 @@ _MARK = re.compile(r"<!-- (results|figure): (\S+) -->")
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Draw every task that a page asks for."""
-    results = read_ledger(LEDGER)
-    named = {mark[2] for page in PAGES for mark in _MARK.finditer(files.get_file_from_path(page).content_string)}
-    for task in sorted(named):
-        add_picture(files, config, f"results/{task}", partial(draw_ledger, results, find_task(task).id))
+    for ledger in dict.fromkeys(LEDGERS.values()):
+        results, pages = read_ledger(ledger), [page for page, own in LEDGERS.items() if own == ledger]
+        named = {mark[2] for page in pages for mark in _MARK.finditer(files.get_file_from_path(page).content_string)}
+        for task in sorted(named):
+            add_picture(files, config, _picture(ledger, task), partial(draw_ledger, results, find_task(task).id))
     return files
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Put figures and tables where the page asks for them."""
-    if page.file.src_uri not in PAGES:
+    ledger = LEDGERS.get(page.file.src_uri)
+    if ledger is None:
         return markdown
-    results = read_ledger(LEDGER)
-    shown = _MARK.sub(partial(_shown, results), markdown)
+    results = read_ledger(ledger)
+    shown = _MARK.sub(partial(_shown, ledger, results), markdown)
     for mark, table in _TABLES.items():
         if mark in shown:
             shown = shown.replace(mark, table(results))
     return shown
 
 
-def _shown(results: Mapping[str, HashedTest], mark: re.Match[str]) -> str:
+def _picture(ledger: Path, task: str) -> str:
+    return f"{ledger.stem}/{task}"
+
+
+def _shown(ledger: Path, results: Mapping[str, HashedTest], mark: re.Match[str]) -> str:
     kind, task = mark.groups()
-    figure = picture_markdown(f"results/{task}", f"survival on the test months of {task}")
+    figure = picture_markdown(_picture(ledger, task), f"survival on the test months of {task}")
     if kind == "figure":
         return figure
     return f"{figure}\n\n{short_ledger_table(results, find_task(task).id)}"

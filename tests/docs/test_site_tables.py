@@ -13,8 +13,10 @@ from rl2grid.analysis.ledger_table import ledger_rows, short_ledger_table
 from rl2grid.envs.tasks import find_task
 from rl2grid.records.ledger import agent_of, read_ledger
 from rl2grid.records.statistics import estimate
+from rl2grid.studies.study import load_study
 
 LEDGER = ROOT / "benchmarks" / "results" / "baselines.json"
+PAPER = ROOT / "benchmarks" / "results" / "paper.json"
 
 
 @pytest.fixture
@@ -55,6 +57,19 @@ def test_a_short_table_has_the_best_first():
     assert survivals == sorted(survivals, reverse=True)
     alone = {digest: one for digest, one in read_ledger(LEDGER).items() if one.agent != "do-nothing"}
     assert "to do-nothing" not in short_ledger_table(alone, find_task("bus36-M-H1").id)
+
+
+def test_every_cell_of_the_paper_has_its_test():
+    def named(task, agent, heuristic):
+        return task, agent, heuristic or "none"
+
+    cells = load_study("baselines", "full").cells
+    tested = read_ledger(PAPER).values()
+    assert {named(cell.task.id, cell.agent, cell.heuristic) for cell in cells} == {
+        named(one.task, one.agent, one.heuristic) for one in tested
+    }
+    budgets = {one.configuration["hyperparameters"]["total_timesteps"] for one in tested if one.training}
+    assert budgets == {cell.training.hyperparameters["total_timesteps"] for cell in cells if cell.training is not None}
 
 
 def test_the_first_page_says_what_was_measured():
