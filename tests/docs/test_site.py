@@ -24,7 +24,7 @@ def test_the_page_of_the_tasks_describes_every_keyword(site):
 def test_the_first_page_has_a_picture_the_result_and_the_line_that_installs(site):
     page = (site / "index.html").read_text(encoding="utf-8")
     pictures = set(re.findall(r'src="(assets/[^"#]+[.]png)', page))
-    assert {"assets/grids/bus36-MO-v0-light.png", "assets/results/bus14-T0-dark.png"} <= pictures
+    assert {"assets/grids/bus36-MO-v0-light.png", "assets/baselines/bus14-T0-dark.png"} <= pictures
     assert all((site / picture).read_bytes().startswith(b"\x89PNG") for picture in pictures)
     assert "% of a month survived" in re.sub("<[^>]+>", "", page)
     assert "pip" in page
