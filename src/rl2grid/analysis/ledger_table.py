@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from rl2grid.analysis.result_tables import merits
 from rl2grid.analysis.table import difference_cell, markdown_row, p_cell, share_text, with_interval
 from rl2grid.envs.tasks import find_task, short_id
 from rl2grid.errors import one_of
@@ -122,8 +123,8 @@ def ledger_table(results: Mapping[str, HashedTest], task: str | None = None, ref
 def short_ledger_table(results: Mapping[str, HashedTest], task: str) -> str:
     """The results of one task in few columns, as Markdown: the best first, which is bold.
 
-    The best survives longest; under a constraint it has most safe months, and of equals the longest survival. A
-    constrained task shows its own cost and safe months, others the safe months in the sense of TLO.
+    The order is by :func:`merits`. A constrained task shows its own cost and safe months, others the safe months in the
+    sense of TLO.
 
     Args:
         results: of a ledger.
@@ -133,12 +134,7 @@ def short_ledger_table(results: Mapping[str, HashedTest], task: str) -> str:
     compared = _compared(rows, REFERENCE)
     heading = f"to {REFERENCE}"
     limit = find_task(task).constraint
-
-    def merits(row: LedgerRow) -> tuple[float, ...]:
-        scores = (*((row.safe(limit),) if limit else ()), row.scores("survival"))
-        return tuple(float(one.values.mean()) for one in scores)
-
-    ranked = sorted(enumerate(rows), key=lambda one: merits(one[1]), reverse=True)
+    ranked = sorted(enumerate(rows), key=lambda one: merits(one[1], limit), reverse=True)
     counted = limit or "TLO"
     names = ("agent", "survival", heading, "completed", f"cost {limit}", f"{counted} safe")
     columns: dict[str, list[str]] = {name: [] for name in names}

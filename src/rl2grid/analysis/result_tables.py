@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Protocol
 
 from rl2grid.analysis.comparison_table import comparison_table, pair_cells, pairwise
 from rl2grid.analysis.l2rpn_table import l2rpn_table, operation_table, stored_scores
@@ -24,6 +25,7 @@ from rl2grid.records.methods import COSTS, Method, interval_words
 from rl2grid.records.statistics import (
     Aggregate,
     Estimate,
+    Scores,
     estimate,
     iqm_score,
     mean_score,
@@ -47,6 +49,16 @@ _METHOD = (Column("Task", words=True), Column("Method", words=True))
 
 Methods = Mapping[str, Sequence[Method]]
 """By task."""
+
+
+class Played(Protocol):
+    """What was played of a task, by one method or one configuration of a ledger."""
+
+    def scores(self, column: str) -> Scores:
+        """A column of the episodes."""
+
+    def safe(self, constraint: str) -> Scores:
+        """Whether an episode was completed within the threshold of a constraint."""
 
 
 def result_tables(methods: Methods) -> tuple[ResultTable, ...]:
@@ -86,14 +98,15 @@ def entry_table(methods: Mapping[str, Method]) -> ResultTable:
 
 
 def ranking(methods: Sequence[Method]) -> list[Method]:
-    """Methods of one task, best first: by survival; under a constraint by the share of safe episodes before that."""
+    """Methods of one task, best first; see :func:`merits`."""
     limit = methods[0].task.constraint
+    return sorted(methods, key=lambda method: merits(method, limit), reverse=True)
 
-    def score(method: Method) -> tuple[float, ...]:
-        scores = (*((method.safe(limit),) if limit else ()), method.scores("survival"))
-        return tuple(-float(one.values.mean()) for one in scores)
 
-    return sorted(methods, key=score)
+def merits(played: Played, limit: str | None) -> tuple[float, ...]:
+    """What the better one has more of: survival, and under a constraint, before it, the share of safe episodes."""
+    scores = (*((played.safe(limit),) if limit else ()), played.scores("survival"))
+    return tuple(float(one.values.mean()) for one in scores)
 
 
 def _ranking_table(
