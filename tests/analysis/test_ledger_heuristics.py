@@ -26,7 +26,7 @@ def test_agents_have_a_row_and_heuristics_a_column():
     assert not cells[0][2].endswith(")")  # nothing was trained
     assert cells[0][3] == ""
     assert cells[1][2].startswith("0.400 [")
-    assert cells[1][3].startswith("0.800 [")
-    assert cells[1][3].endswith("] (2)")
+    assert cells[1][3].startswith("**0.800 [")  # the highest of those that are shown
+    assert cells[1][3].endswith("]** (2)")
     assert cells[2][2] == ""
     assert cells[2][3].startswith("**0.500 [")

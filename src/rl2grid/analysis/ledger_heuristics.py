@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 from rl2grid.analysis.ledger_overview import by_task, survival_of
 from rl2grid.analysis.ledger_table import LedgerRow
@@ -18,8 +18,8 @@ _NO_HEURISTIC = "none"
 def heuristic_table(results: Mapping[str, HashedTest]) -> str:
     """Survival of every agent by the heuristic beside it, as Markdown, a row per task and agent.
 
-    Cells have the interval and, of what was trained, the number of trainings; the highest of a task is bold. Where an
-    agent has several rows of one heuristic, such as of other budgets, the one with most trainings is shown.
+    Cells have the interval and, of what was trained, the number of trainings. Where an agent has several rows of one
+    heuristic, such as of other budgets, the one with most trainings is shown. The highest of what a task shows is bold.
 
     Args:
         results: of a ledger.
@@ -30,10 +30,12 @@ def heuristic_table(results: Mapping[str, HashedTest]) -> str:
     headings = ["vanilla" if name == _NO_HEURISTIC else name for name in heuristics]
     lines = [markdown_row(["task", "agent", *headings]), "|:--|:--|" + "--:|" * len(headings)]
     for task, of_task in rows.items():
-        highest = max(survival_of(row) for row in of_task)
+        shown: dict[tuple[str, str], LedgerRow] = {}
+        for row in sorted(of_task, key=lambda one: -len(one.results)):
+            shown.setdefault((row.first.player, _heuristic(row)), row)
+        highest = max(survival_of(row) for row in shown.values())
         for agent in dict.fromkeys(row.first.player for row in of_task):
-            own = [row for row in of_task if row.first.player == agent]
-            cells = [_cell([row for row in own if _heuristic(row) == name], highest) for name in heuristics]
+            cells = [_cell(shown.get((agent, name)), highest) for name in heuristics]
             lines.append(markdown_row([short_id(task), agent, *cells]))
     return "\n".join(lines)
 
@@ -42,8 +44,7 @@ def _heuristic(row: LedgerRow) -> str:
     return row.first.heuristic or _NO_HEURISTIC
 
 
-def _cell(rows: Sequence[LedgerRow], highest: float) -> str:
-    row = max(rows, key=lambda one: len(one.results), default=None)
+def _cell(row: LedgerRow | None, highest: float) -> str:
     if row is None:
         return ""
     survival = with_interval(estimate(row.scores("survival")), 3)
