@@ -153,12 +153,18 @@ def shortlisted(task: str, size: int | None, **changes: Any) -> Any:
     return PPO(ppo.Args(**sizes | changes, shortlist=size), NothingToPlay(task))
 
 
-@pytest.mark.parametrize(("first", "then"), [("bus36-M-T1", "bus36-M-T0"), ("bus36-M-T0", "bus36-M-T2")])
-def test_a_policy_with_a_shortlist_plays_on_at_another_level(tmp_path: Path, first: str, then: str):
-    path = saved(tmp_path / "first.pt", shortlisted(first, 20), "ppo", first)
+@pytest.mark.parametrize(
+    ("first", "size", "then"),
+    [("bus36-M-T1", 20, "bus36-M-T0"), ("bus36-M-T0", 20, "bus36-M-T2"), ("bus36-M-T0", None, "bus36-M-T1")],
+)
+def test_a_policy_plays_on_at_another_level(tmp_path: Path, first: str, size: int | None, then: str):
+    path = saved(tmp_path / "first.pt", shortlisted(first, size), "ppo", first)
     contents = {**load_checkpoint(Path(path)), "env_keywords": {"heuristic": None}}
     save_checkpoint(Path(path), contents)
-    mine = shortlisted(then, 20, start_from=path)
+    if size is None:
+        with pytest.raises(UsageError, match="its shortlist is 50: set shortlist to the same"):
+            shortlisted(then, None, start_from=path).begin_as_asked()
+    mine = shortlisted(then, size or 50, start_from=path)
     mine.begin_as_asked()
     played: dict[str, list[int]] = {}
     for task, policy in ((first, contents["policy"]), (then, mine.policy_state())):
@@ -183,7 +189,7 @@ def test_a_policy_with_a_shortlist_plays_on_at_another_level(tmp_path: Path, fir
 )
 def test_a_policy_plays_on_in_no_other_task(tmp_path: Path, first: str, then: str, size: int | None):
     path = saved(tmp_path / "first.pt", shortlisted(first, size), "ppo", first)
-    with pytest.raises(UsageError, match=f"it is of task rl2grid/{first}-v0, not rl2grid/{then}-v0, and only one with"):
+    with pytest.raises(UsageError, match=f"it is of task rl2grid/{first}-v0, not rl2grid/{then}-v0, and only one of"):
         shortlisted(then, size, start_from=path).begin_as_asked()
 
 

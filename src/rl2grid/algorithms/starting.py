@@ -90,8 +90,8 @@ class StartingPolicy:
         network = self.policy["factory"]["name"]
         if network != args.network:
             raise self.refusal(f"its network is {network!r}, not {args.network!r}: set network to the former")
-        if self.policy["factory"].get("shortlist") != args.shortlist:
-            raise self.refusal(f"its shortlist is {self.policy['factory'].get('shortlist')}: set shortlist to the same")
+        if self._shortlist_in(spec) != args.shortlist:
+            raise self.refusal(f"its shortlist is {self._shortlist_in(spec)}: set shortlist to the same")
         scaled = self.policy["normalizer"] is not None
         if scaled != args.normalize_observations:
             raise self.refusal(f"normalize_observations is {scaled} there: set it to the same")
@@ -107,17 +107,19 @@ class StartingPolicy:
 
     def moved_to(self, spec: Spec) -> StartingPolicy:
         """The same policy as one of the task of ``spec``, for which :meth:`check` has found it to fit."""
-        factory = {**self.policy["factory"], "spec": spec.state_dict()}
+        size = self._shortlist_in(spec)
+        chosen = {} if size is None else {"shortlist": size}
+        factory = {**self.policy["factory"], "spec": spec.state_dict(), **chosen}
         return replace(self, policy={**self.policy, "factory": factory})
 
     def _chooses_as_in(self, spec: Spec) -> bool:
         """Whether it chooses among actions that it has in another task of the grid as well, in the same order.
 
-        Levels of topology actions begin with those of the lower ones: a policy with a shortlist of one level is a
-        policy of every level that has its actions.
+        Levels of topology actions begin with those of the lower ones: a policy of one level, or of a shortlist of its
+        actions, is a policy of every level that has these.
         """
         theirs = self.policy["factory"]["spec"]
-        size = self.policy["factory"].get("shortlist")
+        size = self._shortlist_in(spec)
         if size is None or theirs["task"] is None or spec.task is None or size > spec.action_size:
             return False
         a, b = find_task(theirs["task"]), find_task(spec.task)
@@ -127,6 +129,13 @@ class StartingPolicy:
         if first is None or second is None:
             return False
         return all(np.array_equal(getattr(first, name), getattr(second, name)) for name in ("kind", "target", "mask"))
+
+    def _shortlist_in(self, spec: Spec) -> int | None:
+        """How many actions it chooses among in the task of ``spec``; None: all of them."""
+        theirs = self.policy["factory"]["spec"]
+        size: int | None = self.policy["factory"].get("shortlist")
+        elsewhere = size is None and not theirs["continuous"] and theirs["action_size"] < spec.action_size
+        return theirs["action_size"] if elsewhere and theirs["task"] != spec.task else size
 
     def refusal(self, why: str) -> UsageError:
         """What is said where it does not fit."""
@@ -142,9 +151,7 @@ _WORDS = {
     "action_size": "{} actions",
 }
 """What a spec says of an environment, in words."""
-_ELSEWHERE = (
-    "and only one with a shortlist goes on in other levels of its grid, where its actions stand in the same order"
-)
+_ELSEWHERE = "and only one of topology actions goes on in other levels of its grid, where these stand in the same order"
 
 
 def _on_shortlist(spec: Spec, size: int) -> ActionCatalogue | None:

@@ -250,6 +250,15 @@ class _Shortlisted(nn.Module):
 
     chosen: Tensor
 
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
+        """Weights of a network of the same actions that had no shortlist fit as well."""
+        inner = f"{prefix}network."
+        mine = [name for name in state_dict if name.startswith(prefix)]
+        if not any(name.startswith(inner) for name in mine):
+            for name in mine:
+                state_dict[inner + name.removeprefix(prefix)] = state_dict.pop(name)
+        super()._load_from_state_dict(state_dict, prefix, *rest)
+
     def forward(self, inputs: Tensor) -> Tensor:
         """Numbers [batch, inputs] -> [batch, width]."""
         numbers = self.network(inputs)
