@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from rl2grid.algorithms.sampling import drawn
+from rl2grid.algorithms.sampling import drawn, legal_log_softmax
 
 
 def test_actions_are_drawn_as_often_as_they_weigh_and_never_without_weight():
@@ -31,3 +31,15 @@ def test_one_number_per_row_is_drawn():
     drawn(torch.rand(7, 50), generator)
     torch.rand(7, generator=same)
     assert torch.equal(generator.get_state(), same.get_state())
+
+
+def test_log_probabilities_are_the_same_where_nothing_is_learned_from_them():
+    logits = torch.randn(5, 7, generator=torch.Generator().manual_seed(0), requires_grad=True)
+    masks = torch.rand(5, 7, generator=torch.Generator().manual_seed(1)) > 0.3
+    for legal in (None, masks):
+        learned_from = legal_log_softmax(logits, legal)
+        with torch.no_grad():
+            played = legal_log_softmax(logits, legal)
+        assert learned_from.requires_grad
+        assert not played.requires_grad
+        assert torch.equal(played, learned_from)

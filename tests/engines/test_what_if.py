@@ -127,6 +127,16 @@ def test_threads_do_not_change_a_bit(grid_id: str) -> None:
             np.testing.assert_array_equal(mine, theirs)
 
 
+def test_a_small_question_is_answered_as_in_a_large_one_and_stays_answered() -> None:
+    engine = played("bus36-MO-v0", 2)
+    catalogue, ids = full_catalogue(engine.grid), sample("bus36-MO-v0", 200)
+    every = what_if(engine, 0, catalogue, ids)
+    answers = [what_if(engine, 0, catalogue, ids[k : k + 4]) for k in range(0, len(ids), 4)]
+    for mine, theirs in zip(every, zip(*answers, strict=True), strict=True):
+        np.testing.assert_array_equal(mine, np.concatenate(theirs))
+    assert len(np.unique(every.worst_loading)) > 50
+
+
 def test_a_stored_snapshot_answers_as_the_engine_does() -> None:
     engine = played("bus118-MOB-v0", 2)
     catalogue, ids = full_catalogue(engine.grid), sample("bus118-MOB-v0", 100)

@@ -67,6 +67,18 @@ def test_normalised_values_are_standardised_and_clipped():
     assert normalizer.normalize(np.array([4.0])).dtype == np.float32
 
 
+def test_what_is_normalised_follows_the_statistics():
+    normalizer, other = ObservationNormalizer(1), ObservationNormalizer(1)
+    assert normalizer.normalize(np.array([4.0])).tolist() == [4.0]
+    normalizer.update(np.array([[1.0], [3.0]]))
+    assert normalizer.normalize(np.array([4.0])) == pytest.approx([2.0])
+    normalizer.update(np.array([[2.0], [10.0]]))  # now of deviation 3.5
+    assert normalizer.normalize(np.array([11.0])) == pytest.approx([7.0 / 12.5**0.5])
+    other.normalize(np.array([4.0]))
+    other.load_state_dict(normalizer.state_dict())
+    assert other.normalize(np.array([11.0])) == normalizer.normalize(np.array([11.0]))
+
+
 def test_a_feature_that_never_moves_is_zero():
     normalizer = ObservationNormalizer(1)
     normalizer.update(np.full((3, 1), 8.0))

@@ -23,7 +23,10 @@ from rl2grid.dense.choices import (
 def legal_log_softmax(logits: Tensor, masks: Tensor | None) -> Tensor:
     """Log-probabilities [batch, actions] of logits and legal actions of the same shape; illegal: large and negative."""
     if _is_compiled(logits):
-        return _LogSoftmax.apply(logits, _legal(logits, masks))  # type: ignore[no-untyped-call, no-any-return]
+        legal = _legal(logits, masks)
+        if not torch.is_grad_enabled():
+            return _log_softmax(logits, legal)
+        return _LogSoftmax.apply(logits, legal)  # type: ignore[no-untyped-call, no-any-return]
     if masks is not None:
         logits = logits.masked_fill(~masks, NEVER)
     return logits.log_softmax(dim=-1)
@@ -63,14 +66,19 @@ def _legal(logits: Tensor, masks: Tensor | None) -> Tensor:
     return torch.ones_like(logits, dtype=torch.bool) if masks is None else masks.expand_as(logits).contiguous()
 
 
+def _log_softmax(logits: Tensor, legal: Tensor) -> Tensor:
+    rows = logits.detach().contiguous()
+    log_probabilities = torch.empty_like(rows)
+    write_log_softmax(rows.numpy(), legal.numpy(), log_probabilities.numpy())
+    return log_probabilities
+
+
 class _LogSoftmax(torch.autograd.Function):
     """Log-probabilities of legal actions."""
 
     @staticmethod
     def forward(ctx: Any, logits: Tensor, legal: Tensor) -> Tensor:
-        rows = logits.detach().contiguous()
-        log_probabilities = torch.empty_like(rows)
-        write_log_softmax(rows.numpy(), legal.numpy(), log_probabilities.numpy())
+        log_probabilities = _log_softmax(logits, legal)
         ctx.save_for_backward(legal, log_probabilities)
         return log_probabilities
 

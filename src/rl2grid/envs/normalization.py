@@ -33,6 +33,7 @@ class ObservationNormalizer:
         self.mean = np.zeros(size, np.float64)
         self._squares = np.zeros(size, np.float64)
         self._frozen = False
+        self._deviation: NDArray[np.float64] | None = None
 
     @property
     def frozen(self) -> bool:
@@ -47,8 +48,9 @@ class ObservationNormalizer:
     @property
     def deviation(self) -> NDArray[np.float64]:
         """Standard deviation of every feature [size], as it is divided by: never 0."""
-        deviation: NDArray[np.float64] = np.sqrt(self.variance + _EPSILON)
-        return deviation
+        if self._deviation is None:
+            self._deviation = np.sqrt(self.variance + _EPSILON)
+        return self._deviation
 
     def freeze(self) -> None:
         """Ignore all further updates; evaluation must not move what training learned to read."""
@@ -66,6 +68,7 @@ class ObservationNormalizer:
         self._squares += np.square(batch - mean).sum(axis=0) + np.square(shift) * (self.count * count / total)
         self.mean += shift * (count / total)
         self.count = total
+        self._deviation = None
 
     def normalize(self, observations: NDArray[Any]) -> NDArray[np.float32]:
         """Observations [..., size] as multiples of the standard deviation around the mean, clipped, float32."""
@@ -89,6 +92,7 @@ class ObservationNormalizer:
                 "of another version or of another task."
             )
         self.count, self.mean, self._squares = int(state["count"]), mean, squares
+        self._deviation = None
 
     @property
     def normaliser_hash(self) -> str:

@@ -38,6 +38,8 @@ _KINDS = np.full(len(ActionKind), -1, np.int8)
 _KINDS[[ActionKind.NOTHING, ActionKind.MOVE, ActionKind.SWITCH]] = NOTHING, MOVE, SWITCH
 _SMALLEST_PART = 64
 """Changes that are worth a thread."""
+_FEW = 128
+"""Changes of a question whose arrays are kept for the next one of its size."""
 _DISPATCH = int(GameOver.DISPATCH)
 
 
@@ -76,6 +78,20 @@ class Security(NamedTuple):
     n_outages: int  # lines in service
 
 
+class _Room(NamedTuple):
+    """Where the changes and the outcomes of a question lie."""
+
+    changes: Handle[Changes]
+    outcomes: Handle[ChangeOutcomes]
+
+
+def _new_room(shape: tuple[int, ...], n_line: int) -> _Room:
+    """Room for changes whose masks have a shape, [change, word], without loadings of single lines."""
+    n, n_words = shape
+    changes = Changes(np.zeros(n, np.int8), np.zeros(n, np.int32), np.zeros((n, n_words), np.uint64))
+    return _Room(Handle(changes), Handle(new_outcomes(n, np.zeros((0, n_line), np.float32))))
+
+
 class WhatIf:
     """Answers what-if questions about one grid; keeps the workspace, so make it once.
 
@@ -99,6 +115,7 @@ class WhatIf:
         self._snapshot = new_snapshot(grid)
         self._solvers = [BatchSolver(grid, self._network, wiring, self._snapshot) for _ in range(num_threads)]
         self._threads = Threads(num_threads, "what-if")
+        self._rooms: dict[tuple[int, ...], _Room] = {}
 
     def actions(
         self, snapshot: Snapshot, catalogue: ActionCatalogue, ids: Ids | None = None, rho: F32 | None = None
@@ -157,19 +174,31 @@ class WhatIf:
             raise UsageError(f"rho must be a contiguous float32 array of shape ({n}, {n_line}), got {rho.shape}.")
         for kept, array in zip(self._snapshot, snapshot, strict=True):
             np.copyto(kept, array)
-        outcomes = new_outcomes(n, np.zeros((0, n_line), np.float32) if rho is None else rho)
-        handles = Handle(changes), Handle(outcomes)
+        if rho is not None or n > _FEW:
+            outcomes = new_outcomes(n, np.zeros((0, n_line), np.float32) if rho is None else rho)
+            self._solve(changes, _Room(Handle(changes), Handle(outcomes)))
+            return outcomes
+        shape = changes.mask.shape
+        if shape not in self._rooms:
+            self._rooms[shape] = _new_room(shape, n_line)
+        room = self._rooms[shape]
+        asked = room.changes.structure
+        asked.kind[:], asked.target[:], asked.mask[:] = changes
+        self._solve(changes, room)
+        return ChangeOutcomes._make(array.copy() for array in room.outcomes.structure)
+
+    def _solve(self, changes: Changes, room: _Room) -> None:
+        """Write the outcomes of ``changes``, which lie in ``room``."""
         order = np.lexsort((changes.target, -changes.kind)).astype(np.int32)
         parts = self._parts(order)
 
         def solve_part(k: int) -> None:
-            self._solvers[k].solve(*handles, parts[k])
+            self._solvers[k].solve(*room, parts[k])
 
         if len(parts) == 1:
             solve_part(0)
         else:
             self._threads.map(solve_part, range(len(parts)))
-        return outcomes
 
     def _parts(self, order: I32) -> list[I32]:
         n_parts = min(len(self._solvers), len(order) // _SMALLEST_PART)
