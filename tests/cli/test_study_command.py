@@ -55,7 +55,7 @@ def test_status_before_anything_began(capsys, file: str, tmp_path: Path):
 @pytest.mark.parametrize(
     ("command_line", "part"),
     [
-        (["run", "papr"], "(did you mean 'paper'?): choose one of baselines, field, field-1, paper"),
+        (["run", "papr"], "(did you mean 'paper'?): choose one of baselines, field, field-1, field-2, paper"),
         (["run", "FILE", "--scale", "quik"], "Scale 'quik' does not exist (did you mean 'quick'?)"),
         (["run", "FILE", "--backend", "cloud"], "Backend 'cloud' does not exist: choose one of local, ray, slurm"),
         (["run", "FILE", "--jobs", "0"], "--jobs 0 is not allowed"),
