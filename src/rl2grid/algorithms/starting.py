@@ -134,8 +134,9 @@ class StartingPolicy:
         """How many actions it chooses among in the task of ``spec``; None: all of them."""
         theirs = self.policy["factory"]["spec"]
         size: int | None = self.policy["factory"].get("shortlist")
-        elsewhere = size is None and not theirs["continuous"] and theirs["action_size"] < spec.action_size
-        return theirs["action_size"] if elsewhere and theirs["task"] != spec.task else size
+        if size is not None or theirs["continuous"] or theirs["task"] == spec.task:
+            return size
+        return theirs["action_size"] if theirs["action_size"] < spec.action_size else None
 
     def refusal(self, why: str) -> UsageError:
         """What is said where it does not fit."""

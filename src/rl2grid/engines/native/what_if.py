@@ -33,6 +33,7 @@ from rl2grid.powerflow.batch import (
     new_wiring,
 )
 from rl2grid.powerflow.model import Network, load_network
+from rl2grid.structures import allocate
 
 _KINDS = np.full(len(ActionKind), -1, np.int8)
 _KINDS[[ActionKind.NOTHING, ActionKind.MOVE, ActionKind.SWITCH]] = NOTHING, MOVE, SWITCH
@@ -88,7 +89,7 @@ class _Room(NamedTuple):
 def _new_room(shape: tuple[int, ...], n_line: int) -> _Room:
     """Room for changes whose masks have a shape, [change, word], without loadings of single lines."""
     n, n_words = shape
-    changes = Changes(np.zeros(n, np.int8), np.zeros(n, np.int32), np.zeros((n, n_words), np.uint64))
+    changes = allocate(Changes, {"change": n, "word": n_words})
     return _Room(Handle(changes), Handle(new_outcomes(n, np.zeros((0, n_line), np.float32))))
 
 
@@ -176,7 +177,7 @@ class WhatIf:
             np.copyto(kept, array)
         if rho is not None or n > _FEW:
             outcomes = new_outcomes(n, np.zeros((0, n_line), np.float32) if rho is None else rho)
-            self._solve(changes, _Room(Handle(changes), Handle(outcomes)))
+            self._solve(_Room(Handle(changes), Handle(outcomes)))
             return outcomes
         shape = changes.mask.shape
         if shape not in self._rooms:
@@ -184,11 +185,12 @@ class WhatIf:
         room = self._rooms[shape]
         asked = room.changes.structure
         asked.kind[:], asked.target[:], asked.mask[:] = changes
-        self._solve(changes, room)
+        self._solve(room)
         return ChangeOutcomes._make(array.copy() for array in room.outcomes.structure)
 
-    def _solve(self, changes: Changes, room: _Room) -> None:
-        """Write the outcomes of ``changes``, which lie in ``room``."""
+    def _solve(self, room: _Room) -> None:
+        """Write the outcomes of the changes."""
+        changes = room.changes.structure
         order = np.lexsort((changes.target, -changes.kind)).astype(np.int32)
         parts = self._parts(order)
 
