@@ -34,6 +34,7 @@ from rl2grid.algorithms.networks import (
 )
 from rl2grid.algorithms.networks.mlp import Layers
 from rl2grid.algorithms.registry import find_algorithm
+from rl2grid.dense.choices import NEVER
 from rl2grid.envs.registration import register_all
 from rl2grid.envs.spec import Spec, task_spec
 from rl2grid.envs.tasks import find_task
@@ -203,6 +204,20 @@ def test_a_factory_comes_back_from_plain_values():
     factory = NetworkFactory(task_spec(find_task("bus14-T0")), "lines", torch.Generator())
     again = NetworkFactory.from_state(json.loads(json.dumps(factory.state_dict())))
     assert (again.name, again.spec.grid, again.generator) == ("lines", factory.spec.grid, None)
+
+
+@pytest.mark.parametrize("name", ["mlp", "gnn", "action-embedding"])
+def test_weights_for_all_actions_of_a_level_fit_a_shortlist_of_them(name: str):
+    lower, higher = (task_spec(find_task(task)) for task in ("bus36-M-T0", "bus36-M-T1"))
+    first = NetworkFactory(lower, name, torch.Generator().manual_seed(0)).make(Output(1, 1), (8,))
+    then = NetworkFactory(higher, name, torch.Generator().manual_seed(1), 50).make(Output(1, 1), (8,))
+    then.load_state_dict(first.state_dict())
+    inputs = torch.randn(3, lower.observation_size, generator=torch.Generator().manual_seed(2))
+    with torch.no_grad():
+        numbers, of_shortlist = first(inputs), then(inputs)
+    assert of_shortlist.shape == (3, 1 + higher.action_size)
+    assert torch.equal(of_shortlist[:, :51], numbers)
+    assert (of_shortlist[:, 51:] == NEVER).all()
 
 
 def test_weights_do_not_come_from_the_global_random_state():
