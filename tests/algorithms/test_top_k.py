@@ -11,7 +11,7 @@ import pytest
 
 import rl2grid
 from rl2grid.algorithms.policy_agent import PolicyAgent, load_agent
-from rl2grid.algorithms.top_k import FEW, TopK
+from rl2grid.algorithms.top_k import TopK
 from rl2grid.envs.registration import register_all
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import make_agent
@@ -88,7 +88,7 @@ def test_of_the_best_actions_the_first_that_is_safe_is_played_else_the_least_loa
         chosen_places.add(expected)
     env.close()
     assert len(chosen_places) > 1, "the what-if never changed anything"
-    assert max(chosen_places) >= FEW, "the first question was always enough"
+    assert max(chosen_places) > 3, "one of the best was always safe"
 
 
 def test_the_reference_engine_is_asked_by_simulate(run: Path):

@@ -14,6 +14,7 @@ from rl2grid.engines.native.engine import NativeEngine
 from rl2grid.engines.native.what_if import (
     Moment,
     WhatIf,
+    first_safe,
     forecast_of,
     n_minus_1_score,
     snapshot_of,
@@ -137,6 +138,44 @@ def test_a_small_question_is_answered_as_in_a_large_one_and_stays_answered() -> 
     assert len(np.unique(every.worst_loading)) > 50
 
 
+@pytest.mark.parametrize("grid_id", GRID_IDS)
+def test_the_first_safe_action_is_the_first_that_the_what_if_calls_safe(grid_id: str) -> None:
+    catalogue, random = full_catalogue(load_grid(grid_id)), np.random.default_rng(5)
+    places = []
+    for number in range(3):
+        asked = forecast_of(played(grid_id, number), 0)
+        assert asked is not None
+        unsolvable = asked._replace(load_p=4 * asked.load_p, gen_p=4 * asked.gen_p)
+        for snapshot in (asked, unsolvable):
+            ids = random.permutation(np.append(sample(grid_id, 30, number)[:34], 0)).astype(np.int32)
+            worst = solver_of(grid_id).actions(snapshot, catalogue, ids).worst_loading.astype(float)
+            some = np.unique(worst[np.isfinite(worst)]) if np.isfinite(worst).any() else np.ones(1)
+            for limit in (0.0, *np.quantile(some, (0.0, 0.02, 0.1, 0.5)).tolist(), np.inf):
+                found = solver_of(grid_id).first_safe(snapshot, catalogue, ids, limit)
+                safe = np.flatnonzero(worst < limit)
+                expected = int(safe[0]) if len(safe) else int(worst.argmin())
+                assert found == (expected, worst[expected], len(safe) > 0)
+                places.append(expected)
+    assert len(set(places)) > 2
+
+
+def test_the_environments_first_safe_action_is_of_the_forecast() -> None:
+    engine = played("bus118-M", 1)
+    catalogue, ids = full_catalogue(engine.grid), sample("bus118-M", 10)
+    worst = what_if(engine, 0, catalogue, ids, Moment.NEXT_STEP).worst_loading.astype(float)
+    limit = float(np.unique(worst)[1])
+    found = first_safe(engine, 0, catalogue, ids, limit)
+    assert found == (np.flatnonzero(worst < limit)[0], worst.min(), True)
+    present = what_if(engine, 0, catalogue, ids).worst_loading
+    assert found.worst_loading not in present
+
+
+def test_a_safe_action_is_found_among_some() -> None:
+    engine = played("bus14", 1)
+    with pytest.raises(UsageError, match="give at least one"):
+        first_safe(engine, 0, full_catalogue(engine.grid), np.zeros(0, np.int32), 0.95)
+
+
 def test_a_stored_snapshot_answers_as_the_engine_does() -> None:
     engine = played("bus118-MOB-v0", 2)
     catalogue, ids = full_catalogue(engine.grid), sample("bus118-MOB-v0", 100)
@@ -209,6 +248,7 @@ def test_a_forecast_that_generators_cannot_follow_dooms_every_action(monkeypatch
     outcomes = what_if(engine, 0, full_catalogue(engine.grid), moment=Moment.NEXT_STEP)
     assert (outcomes.verdict == GameOver.DISPATCH).all()
     assert np.isinf(outcomes.worst_loading).all()
+    assert first_safe(engine, 0, full_catalogue(engine.grid), sample("bus14", 3), 0.95) == (0, np.inf, False)
 
 
 def test_looking_ahead_leaves_the_environment_as_it_was() -> None:

@@ -19,6 +19,7 @@ from rl2grid.powerflow.batch import (
     MOVE,
     NOTHING,
     SWITCH,
+    UNASKED,
     BatchSolver,
     Changes,
     Snapshot,
@@ -174,6 +175,24 @@ def test_a_change_has_the_same_outcome_in_any_company(grid_id: str) -> None:
             np.testing.assert_array_equal(getattr(alone, name)[k], getattr(together, name)[k], name)
         if k:
             assert np.isnan(alone.rho[k - 1]).all(), "an outcome was written that nobody asked for"
+
+
+def test_behind_the_first_safe_change_only_its_company_is_solved() -> None:
+    case, draw = case_of("bus36-MO-v0"), np.random.default_rng(4)
+    snapshot, changes = case.random_snapshot(draw, 1.0), case.random_changes(draw, 60)
+    every = case.solve(snapshot, changes)
+    for limit in (0.0, float(np.quantile(every.worst_loading, 0.01)), float(every.worst_loading[5]), np.inf):
+        outcomes = new_outcomes(len(changes.kind), np.zeros((0, case.grid.n_line), np.float32))
+        company = np.zeros(len(changes.kind), np.int32)
+        case.load(snapshot)
+        found = case.solver.find_safe(Handle(changes), Handle(outcomes), limit, company)
+        safe = np.flatnonzero(every.worst_loading < limit)
+        assert found == (safe[0] if len(safe) else every.worst_loading.argmin())
+        groups = [(kind, target if kind == MOVE else 0) for kind, target in zip(*changes[:2], strict=True)]
+        tried = set(groups if not len(safe) else groups[: found + 1])
+        asked = np.array([group in tried for group in groups])
+        np.testing.assert_array_equal(outcomes.verdict != UNASKED, asked)
+        np.testing.assert_array_equal(outcomes.worst_loading[asked], every.worst_loading[asked])
 
 
 def test_most_changes_of_an_everyday_state_need_no_cold_flow() -> None:

@@ -10,21 +10,16 @@ import numpy as np
 from rl2grid.agents.agent import Action, Considered, Info, Observation
 from rl2grid.agents.dispatch import worst_loading_if_legal
 from rl2grid.algorithms.policy_agent import PolicyAgent
-from rl2grid.arrays import F64
 from rl2grid.errors import UsageError
 from rl2grid.mdp.heuristics import SAFE_RHO
-
-FEW = 4
-"""Candidates that the first question is about: where a grid can be made safe, one of them mostly does it."""
 
 
 class TopK:
     """Plays the first of a policy's ``k`` best legal actions that the forecast calls safe.
 
     Safe is what leaves every line below 95% in the next step. Where none of them does, the one with the least worst
-    loading is played. With ``k`` = 1 it is the policy. A topology task on the native engine asks a what-if about the
-    best :data:`FEW` (:meth:`PowerGridEnv.what_if`) and, where none of them is safe, another about all others; other
-    tasks ask one ``simulate`` after the other until one is.
+    loading is played. With ``k`` = 1 it is the policy. A topology task on the native engine asks once
+    (:meth:`PowerGridEnv.first_safe`); other tasks ask one ``simulate`` after the other until one is safe.
 
     Continuous actions have no best few: the candidates are the most probable one and, where the forecast does not call
     that safe, ``k`` - 1 around it, :data:`~rl2grid.algorithms.policy_agent.WIDTH` times as far away as the policy
@@ -109,25 +104,15 @@ class TopK:
         """The place of the one to play, and whether the forecast calls it safe; one alone is not looked at."""
         if len(candidates) == 1:
             return 0, True
-        loading = np.zeros(0)
-        for part in self._parts(candidates):
-            loading = np.concatenate((loading, self._loading(part)))
-            safe = np.flatnonzero(loading < SAFE_RHO)
-            if len(safe):
-                return int(safe[0]), True
-        return int(loading.argmin()), False
-
-    def _parts(self, candidates: list[Action]) -> list[list[Action]]:
-        """Candidates that are looked at together, one part after the other: behind a safe one nobody looks."""
-        if not self._asks_at_once:
-            return [[candidate] for candidate in candidates]
-        return [part for part in (candidates[:FEW], candidates[FEW:]) if part]
-
-    def _loading(self, candidates: list[Action]) -> F64:
-        """The worst loading in the next step after each, by the forecast; infinite where the game would be lost."""
         if self._asks_at_once:
-            return np.asarray(self._env.what_if(candidates).worst_loading, np.float64)
-        return np.array([worst_loading_if_legal(self._env, action) for action in candidates])
+            found = self._env.first_safe(candidates)
+            return found.place, found.is_safe
+        loading: list[float] = []
+        for k, candidate in enumerate(candidates):
+            loading.append(worst_loading_if_legal(self._env, candidate))
+            if loading[-1] < SAFE_RHO:
+                return k, True
+        return int(np.argmin(loading)), False
 
 
 def _why(chosen: int, is_safe: bool) -> str:

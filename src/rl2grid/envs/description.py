@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sized
+from collections.abc import Iterable, Mapping, Sequence, Sized
 from typing import Any
 
 import gymnasium
@@ -17,6 +17,7 @@ from rl2grid.mdp.actions import (
     INJECTION,
     TOPOLOGY,
     ActionCatalogue,
+    Ids,
     StepAction,
     describe,
     inject,
@@ -64,6 +65,18 @@ def action_number(action: Any, n_actions: int) -> int:
     if array.shape != () or not np.issubdtype(array.dtype, np.integer) or not 0 <= int(array) < n_actions:
         raise UsageError(f"Action {action!r} does not exist: give an integer from 0 to {n_actions - 1}.")
     return int(array)
+
+
+def action_numbers(actions: Sequence[Any], n_actions: int) -> Ids:
+    """Discrete actions as int32 [action].
+
+    Raises:
+        UsageError: one of them is not an integer in 0 .. n_actions - 1.
+    """
+    array = np.asarray(actions)
+    if array.ndim == 1 and np.issubdtype(array.dtype, np.integer) and ((array >= 0) & (array < n_actions)).all():
+        return array.astype(np.int32)
+    return np.array([action_number(action, n_actions) for action in actions], np.int32)
 
 
 def check_parts(task: Task, action: Any) -> None:

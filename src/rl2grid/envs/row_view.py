@@ -17,7 +17,7 @@ from rl2grid.mdp.state import GridState
 from rl2grid.structures import row_of
 
 if TYPE_CHECKING:
-    from rl2grid.engines.native.what_if import ActionOutcomes, OutageOutcomes
+    from rl2grid.engines.native.what_if import ActionOutcomes, FirstSafe, OutageOutcomes
 
 
 class RowMethods(TaskDescription):
@@ -73,6 +73,25 @@ class RowMethods(TaskDescription):
                 engine.
         """
         return self._environments.what_if(self._i, actions)
+
+    def first_safe(self, actions: Sequence[int]) -> FirstSafe:
+        """The first of some topology actions that is safe in the next step, by its forecast, else the least bad.
+
+        Safe is what leaves every line below 95%. It is what :meth:`what_if` says of them, but nothing is solved behind
+        the one that is found.
+
+        Args:
+            actions: ids of those to choose from, at least one, the one to play if it is safe first.
+
+        Returns:
+            ``place`` of the action among those given (where none is safe, the first with the least worst loading), its
+            ``worst_loading`` and ``is_safe``.
+
+        Raises:
+            UsageError: no action, or one that does not exist; continuous actions, no episode in progress, or the
+                reference engine.
+        """
+        return self._environments.first_safe(self._i, actions)
 
     def security(self, action: int | None = None) -> OutageOutcomes:
         """What the loss of each line would do (N-1), in one call; see ``docs/what_if.md``.

@@ -16,7 +16,7 @@ from rl2grid.engines.action_effects import clipping, refusal
 from rl2grid.engines.base import Engine
 from rl2grid.engines.transition import Listener, Transitions
 from rl2grid.engines.worlds import Standing, Trail, World
-from rl2grid.envs.description import action_number, step_action, task_catalogue
+from rl2grid.envs.description import action_number, action_numbers, step_action, task_catalogue
 from rl2grid.envs.episode_table import EpisodeTable, StreamPositions
 from rl2grid.envs.info import episode_info
 from rl2grid.envs.operation import Operation, operation_of
@@ -31,6 +31,7 @@ from rl2grid.mdp.actions import (
     legal_actions,
 )
 from rl2grid.mdp.features import feature_slices, physical_scale
+from rl2grid.mdp.heuristics import SAFE_RHO
 from rl2grid.mdp.legality import verdict_on
 from rl2grid.mdp.observations import observation_writer
 from rl2grid.mdp.rewards import resolve_reward, reward_name
@@ -41,7 +42,7 @@ from rl2grid.scenarios.scenario import STEP
 
 if TYPE_CHECKING:
     from rl2grid.engines.native.engine import NativeEngine
-    from rl2grid.engines.native.what_if import ActionOutcomes, OutageOutcomes, WhatIf
+    from rl2grid.engines.native.what_if import ActionOutcomes, FirstSafe, OutageOutcomes, WhatIf
 
 _RESET_OPTIONS = ("scenario", "start")
 
@@ -215,16 +216,24 @@ class TaskEnvironments:
 
     def what_if(self, i: int, actions: Sequence[int] | None) -> ActionOutcomes:
         """What each action would do in the next step; see :meth:`PowerGridEnv.what_if`."""
-        if self._catalogue is None:
-            raise UsageError(f"{self.task.id} has continuous actions: a what-if is of topology actions.")
-        ids = (
-            None
-            if actions is None
-            else np.array([action_number(action, len(self._catalogue)) for action in actions], np.int32)
-        )
+        catalogue = self._asked_catalogue()
+        ids = None if actions is None else action_numbers(actions, len(catalogue))
         from rl2grid.engines.native.what_if import Moment, what_if
 
-        return what_if(self._native_engine(i), i, self._catalogue, ids, Moment.NEXT_STEP)
+        return what_if(self._native_engine(i), i, catalogue, ids, Moment.NEXT_STEP)
+
+    def first_safe(self, i: int, actions: Sequence[int]) -> FirstSafe:
+        """Which of some actions to play; see :meth:`PowerGridEnv.first_safe`."""
+        catalogue = self._asked_catalogue()
+        ids = action_numbers(actions, len(catalogue))
+        from rl2grid.engines.native.what_if import first_safe
+
+        return first_safe(self._native_engine(i), i, catalogue, ids, float(SAFE_RHO))
+
+    def _asked_catalogue(self) -> ActionCatalogue:
+        if self._catalogue is None:
+            raise UsageError(f"{self.task.id} has continuous actions: a what-if is of topology actions.")
+        return self._catalogue
 
     def security(self, i: int) -> OutageOutcomes:
         """What the loss of each line would do now; see :meth:`PowerGridEnv.security`."""

@@ -71,6 +71,8 @@ NOTHING, MOVE, SWITCH = range(3)
 """Kinds of changes: none; masked elements of a substation to the other busbar; a line opened, or closed."""
 SOLVED, LOAD_CUT_OFF, GENERATOR_CUT_OFF, STORAGE_CUT_OFF, ISLAND, NO_SOLUTION = range(6)
 """Verdicts, numbered and ordered as the reasons of a game over (``rl2grid.mdp.termination.GameOver``)."""
+UNASKED = -1
+"""Instead of the verdict on a change that was not solved."""
 _SETPOINT_TOLERANCE = 1e-7
 """Per unit, as in :mod:`rl2grid.powerflow.ac`."""
 _WORD_BITS = 64
@@ -105,7 +107,7 @@ class ChangeOutcomes(NamedTuple):
     """The flow after each change; entry by entry."""
 
     worst_loading: Annotated[F32, workspace("change", "largest current over thermal limit; inf where there is no flow")]
-    verdict: Annotated[I8, workspace("change", "SOLVED, or why there is no flow")]
+    verdict: Annotated[I8, workspace("change", "SOLVED, or why there is no flow, or UNASKED")]
     overloads: Annotated[I32, workspace("change", "lines above their thermal limit")]
     cold: Annotated[Flags, workspace("change", "the cold recipe was asked")]
     rho: Annotated[F32, workspace("wanted line", "by change: loadings, inf where there is no flow; or none")]
@@ -160,6 +162,12 @@ class BatchSolver:
         self._handle.point_at("changes", changes)
         self._handle.point_at("outcomes", outcomes)
         solve_changes(self._handle.address, order)
+
+    def find_safe(self, changes: Handle[Changes], outcomes: Handle[ChangeOutcomes], limit: float, company: I32) -> int:
+        """The first change that leaves all lines below a limit, or the least bad; see :func:`find_safe_change`."""
+        self._handle.point_at("changes", changes)
+        self._handle.point_at("outcomes", outcomes)
+        return int(find_safe_change(self._handle.address, limit, company))
 
 
 def new_snapshot(grid: Grid) -> Snapshot:
@@ -225,32 +233,90 @@ def solve_changes(address: int, order: I32) -> None:
         order: int32 [k], which changes to solve; moves of one substation in a row. Only their outcomes are written.
     """
     batch = _open_batch(address)
-    network, flow, snapshot, changes = batch.network, batch.flow, batch.snapshot, batch.changes
-    forget_flow(flow, _BASE)
-    status = run_flow(
-        network, flow, _BASE, snapshot.topo_vect, snapshot.gen_p, snapshot.gen_v, snapshot.load_p, snapshot.load_q,
-        snapshot.storage_p,
-    )  # fmt: skip
-    if status != CONVERGED or not flow.known[_BASE]:
-        for k in range(order.shape[0]):
-            _solve_alone(batch, order[k])
-        return
-    equations = equations_of(flow, _BASE)
-    factors = factors_of(flow, _BASE, flow.column[_BASE], flow.panel[_BASE], flow.sparse_row)
+    changes = batch.changes
+    has_base = _solve_base(batch)
     begin = 0
     n = order.shape[0]
     while begin < n:
         kind, target = changes.kind[order[begin]], changes.target[order[begin]]
         end = begin + 1
-        while end < n and changes.kind[order[end]] == kind and (kind != MOVE or changes.target[order[end]] == target):
+        while end < n and _go_together(kind, target, changes.kind[order[end]], changes.target[order[end]]):
             end += 1
-        if kind == NOTHING:
-            _repeat_base(batch, order[begin:end])
-        elif kind == SWITCH:
-            _solve_switches(batch, equations, factors, order[begin:end])
-        else:
-            _solve_moves(batch, equations, factors, order[begin:end])
+        _solve_together(batch, has_base, order[begin:end])
         begin = end
+
+
+@borrowing_jit
+def find_safe_change(address: int, limit: float, company: I32) -> int:
+    """Find the first change after which every line is loaded below a limit, solving no more than that takes.
+
+    Args:
+        address: of the handle to a :class:`Batch`. Outcomes are written of those changes that were solved; of the
+            others the verdict is :data:`UNASKED`.
+        limit: share of the thermal limits.
+        company: workspace, int32 [change].
+
+    Returns:
+        The change; if there is none, the first of those with the least worst loading.
+    """
+    batch = _open_batch(address)
+    changes, outcomes = batch.changes, batch.outcomes
+    n = changes.kind.shape[0]
+    for change in range(n):
+        outcomes.verdict[change] = UNASKED
+    has_base = _solve_base(batch)
+    best = 0
+    for change in range(n):
+        if outcomes.verdict[change] == UNASKED:
+            kind, target = changes.kind[change], changes.target[change]
+            size = 0
+            for other in range(change, n):
+                if _go_together(kind, target, changes.kind[other], changes.target[other]):
+                    company[size] = other
+                    size += 1
+            _solve_together(batch, has_base, company[:size])
+        if np.float64(outcomes.worst_loading[change]) < limit:
+            return change
+        if outcomes.worst_loading[change] < outcomes.worst_loading[best]:
+            best = change
+    return best
+
+
+@borrowing_jit
+def _solve_base(batch: Batch) -> bool:
+    """Solve the base case; whether flows may start from it."""
+    flow, snapshot = batch.flow, batch.snapshot
+    forget_flow(flow, _BASE)
+    status = run_flow(
+        batch.network, flow, _BASE, snapshot.topo_vect, snapshot.gen_p, snapshot.gen_v, snapshot.load_p,
+        snapshot.load_q, snapshot.storage_p,
+    )  # fmt: skip
+    return status == CONVERGED and bool(flow.known[_BASE])
+
+
+@borrowing_jit
+def _go_together(kind: int, target: Index, other_kind: int, other_target: Index) -> bool:
+    """Whether two changes share lanes: moves of one substation, switches of any lines."""
+    return other_kind == kind and (kind != MOVE or other_target == target)
+
+
+@borrowing_jit
+def _solve_together(batch: Batch, has_base: bool, order: I32) -> None:
+    """Solve changes of one kind, moves of one substation."""
+    flow = batch.flow
+    if not has_base:
+        for k in range(order.shape[0]):
+            _solve_alone(batch, order[k])
+        return
+    equations = equations_of(flow, _BASE)
+    factors = factors_of(flow, _BASE, flow.column[_BASE], flow.panel[_BASE], flow.sparse_row)
+    kind = batch.changes.kind[order[0]]
+    if kind == NOTHING:
+        _repeat_base(batch, order)
+    elif kind == SWITCH:
+        _solve_switches(batch, equations, factors, order)
+    else:
+        _solve_moves(batch, equations, factors, order)
 
 
 @borrowing_jit

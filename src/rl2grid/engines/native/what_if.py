@@ -62,6 +62,14 @@ class ActionOutcomes(NamedTuple):
     legal: Flags  # [action] the cooldowns allow it; the other fields do not look at that
 
 
+class FirstSafe(NamedTuple):
+    """Which of some actions, in an order of preference, is to be played."""
+
+    place: int  # of the first that is safe; where none is, of the first with the least worst loading
+    worst_loading: float  # after it: largest current over thermal limit, inf where no flow is found
+    is_safe: bool
+
+
 class OutageOutcomes(NamedTuple):
     """What the loss of each line would do; entry k belongs to the k-th line asked."""
 
@@ -84,13 +92,15 @@ class _Room(NamedTuple):
 
     changes: Handle[Changes]
     outcomes: Handle[ChangeOutcomes]
+    company: I32  # [change] workspace of a search for one
 
 
 def _new_room(shape: tuple[int, ...], n_line: int) -> _Room:
     """Room for changes whose masks have a shape, [change, word], without loadings of single lines."""
     n, n_words = shape
     changes = allocate(Changes, {"change": n, "word": n_words})
-    return _Room(Handle(changes), Handle(new_outcomes(n, np.zeros((0, n_line), np.float32))))
+    outcomes = new_outcomes(n, np.zeros((0, n_line), np.float32))
+    return _Room(Handle(changes), Handle(outcomes), np.zeros(n, np.int32))
 
 
 class WhatIf:
@@ -132,14 +142,31 @@ class WhatIf:
         Raises:
             UsageError: an action of another kind, or ``rho`` of another shape.
         """
-        if ids is not None:
-            catalogue = catalogue.take(ids)
-        kind = _KINDS[catalogue.kind]
-        if (kind < 0).any():
-            raise UsageError("A what-if is for actions of kind NOTHING, MOVE and SWITCH; others have no topology.")
-        changes = Changes(kind, catalogue.target, catalogue.mask)
+        changes = _changes_of(catalogue, ids)
         outcomes = self.solve(snapshot, changes, rho)
         return ActionOutcomes(*outcomes[:3], legal_changes(snapshot, changes))
+
+    def first_safe(self, snapshot: Snapshot, catalogue: ActionCatalogue, ids: Ids, limit: float) -> FirstSafe:
+        """The first of some actions after which every line is loaded below a limit, else the least bad of them.
+
+        What :meth:`actions` says of each, to the bit, but nothing is solved behind the one that is found. One thread.
+
+        Args:
+            snapshot: the operating point.
+            catalogue: the actions; of kinds NOTHING, MOVE and SWITCH.
+            ids: those to choose from, int32 [action], the one to play if it is safe first.
+            limit: share of the thermal limits.
+
+        Raises:
+            UsageError: no action, or one of another kind.
+        """
+        if not len(ids):
+            raise UsageError("A safe action is found among some: give at least one.")
+        self._write_snapshot(snapshot)
+        room = self._room_of(_changes_of(catalogue, ids))
+        place = self._solvers[0].find_safe(room.changes, room.outcomes, limit, room.company)
+        worst = float(room.outcomes.structure.worst_loading[place])
+        return FirstSafe(place, worst, worst < limit)
 
     def outages(self, snapshot: Snapshot, lines: Ids | None = None, rho: F32 | None = None) -> OutageOutcomes:
         """The flow after the loss of each line (N-1), all others as they are.
@@ -173,20 +200,29 @@ class WhatIf:
         n, n_line = len(changes.kind), self.grid.n_line
         if rho is not None and (rho.shape != (n, n_line) or rho.dtype != np.float32 or not rho.flags.c_contiguous):
             raise UsageError(f"rho must be a contiguous float32 array of shape ({n}, {n_line}), got {rho.shape}.")
-        for kept, array in zip(self._snapshot, snapshot, strict=True):
-            np.copyto(kept, array)
-        if rho is not None or n > _FEW:
-            outcomes = new_outcomes(n, np.zeros((0, n_line), np.float32) if rho is None else rho)
-            self._solve(_Room(Handle(changes), Handle(outcomes)))
+        self._write_snapshot(snapshot)
+        if rho is not None:
+            outcomes = new_outcomes(n, rho)
+            self._solve(_Room(Handle(changes), Handle(outcomes), np.zeros(0, np.int32)))
             return outcomes
-        shape = changes.mask.shape
-        if shape not in self._rooms:
-            self._rooms[shape] = _new_room(shape, n_line)
-        room = self._rooms[shape]
-        asked = room.changes.structure
-        asked.kind[:], asked.target[:], asked.mask[:] = changes
+        room = self._room_of(changes)
         self._solve(room)
         return ChangeOutcomes._make(array.copy() for array in room.outcomes.structure)
+
+    def _write_snapshot(self, snapshot: Snapshot) -> None:
+        """Take over the operating point."""
+        for kept, array in zip(self._snapshot, snapshot, strict=True):
+            np.copyto(kept, array)
+
+    def _room_of(self, changes: Changes) -> _Room:
+        """Room that holds the changes: kept for few of them, of which there will be more."""
+        shape = changes.mask.shape
+        room = self._rooms.get(shape) or _new_room(shape, self.grid.n_line)
+        if shape[0] <= _FEW:
+            self._rooms[shape] = room
+        asked = room.changes.structure
+        asked.kind[:], asked.target[:], asked.mask[:] = changes
+        return room
 
     def _solve(self, room: _Room) -> None:
         """Write the outcomes of the changes."""
@@ -195,7 +231,7 @@ class WhatIf:
         parts = self._parts(order)
 
         def solve_part(k: int) -> None:
-            self._solvers[k].solve(*room, parts[k])
+            self._solvers[k].solve(room.changes, room.outcomes, parts[k])
 
         if len(parts) == 1:
             solve_part(0)
@@ -252,6 +288,17 @@ def what_if(
     return _solver_of(engine, num_threads).actions(snapshot, catalogue, ids)
 
 
+def first_safe(engine: NativeEngine, i: int, catalogue: ActionCatalogue, ids: Ids, limit: float) -> FirstSafe:
+    """Which action to play in environment ``i``, by the forecast of the next step; see :meth:`WhatIf.first_safe`.
+
+    Where the generators cannot follow the forecast, it is the first.
+    """
+    snapshot = forecast_of(engine, i)
+    if snapshot is None:
+        return FirstSafe(0, np.inf, False)
+    return _solver_of(engine, 1).first_safe(snapshot, catalogue, ids, limit)
+
+
 def outages(engine: NativeEngine, i: int) -> OutageOutcomes:
     """The flow after the loss of each line in environment ``i``, as last observed; see :meth:`WhatIf.outages`."""
     return _solver_of(engine, 1).outages(snapshot_of(engine, i))
@@ -287,6 +334,20 @@ def _snapshot(environments: Environments, i: int) -> Snapshot:
         hidden.load_q[i].copy(),
         state.storage_power[i].copy(),
     )
+
+
+def _changes_of(catalogue: ActionCatalogue, ids: Ids | None) -> Changes:
+    """What actions change; of all of a catalogue, or of some.
+
+    Raises:
+        UsageError: one of them changes no topology.
+    """
+    if ids is not None:
+        catalogue = catalogue.take(ids)
+    kind = _KINDS[catalogue.kind]
+    if (kind < 0).any():
+        raise UsageError("A what-if is for actions of kind NOTHING, MOVE and SWITCH; others have no topology.")
+    return Changes(kind, catalogue.target, catalogue.mask)
 
 
 def legal_changes(snapshot: Snapshot, changes: Changes) -> Flags:
