@@ -78,7 +78,7 @@ class RowMethods(TaskDescription):
         """The first of some topology actions that is safe in the next step, by its forecast, else the least bad.
 
         Safe is what leaves every line below 95%. It is what :meth:`what_if` says of them, but nothing is solved behind
-        the one that is found.
+        the one that is found. Cooldowns do not count: give actions that the mask allows.
 
         Args:
             actions: ids of those to choose from, at least one, the one to play if it is safe first.
