@@ -17,7 +17,7 @@ from rl2grid.envs.info_arrays import InfoForm
 from rl2grid.envs.options import TaskOptions
 from rl2grid.envs.row_view import RowView, public_names
 from rl2grid.envs.rows import Batch
-from rl2grid.envs.task_environments import TaskEnvironments
+from rl2grid.envs.task_environments import OF_MASKS, TaskEnvironments
 from rl2grid.envs.tasks import Task
 from rl2grid.errors import one_of
 from rl2grid.handles import Handle
@@ -82,7 +82,7 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
 
     def action_masks(self) -> NDArray[np.bool_]:
         """See :meth:`rl2grid.envs.rows.Rows.action_masks`."""
-        catalogue = self._topology_catalogue()
+        catalogue = self._topology_catalogue(OF_MASKS)
         masks = np.empty((self._n, len(catalogue)), np.bool_)
         write_action_masks(self._state_address, catalogue.runs, catalogue.kind, catalogue.target, masks)
         return masks

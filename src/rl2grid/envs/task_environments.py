@@ -44,6 +44,8 @@ if TYPE_CHECKING:
     from rl2grid.engines.native.engine import NativeEngine
     from rl2grid.engines.native.what_if import ActionOutcomes, FirstSafe, OutageOutcomes, WhatIf
 
+OF_MASKS = "only topology actions have masks"
+"""What is said where masks are asked for and there are none."""
 _RESET_OPTIONS = ("scenario", "start")
 
 
@@ -182,12 +184,17 @@ class TaskEnvironments:
 
     def write_action_mask(self, i: int, out: NDArray[np.bool_]) -> None:
         """Write to ``out`` [action] which topology actions are legal in row ``i``."""
-        catalogue = self._topology_catalogue()
+        catalogue = self._topology_catalogue(OF_MASKS)
         legal_actions(self.transitions.opened_state, i, catalogue.kind, catalogue.target, out)
 
-    def _topology_catalogue(self) -> ActionCatalogue:
+    def _topology_catalogue(self, rule: str) -> ActionCatalogue:
+        """The topology actions of the task.
+
+        Args:
+            rule: what is said where it has none.
+        """
         if self._catalogue is None:
-            raise UsageError(f"{self.task.id} has continuous actions: only topology actions have masks.")
+            raise UsageError(f"{self.task.id} has continuous actions: {rule}.")
         return self._catalogue
 
     def simulate(self, i: int, action: Any, horizon: int) -> SimulationResult:
@@ -216,7 +223,7 @@ class TaskEnvironments:
 
     def what_if(self, i: int, actions: Sequence[int] | None) -> ActionOutcomes:
         """What each action would do in the next step; see :meth:`PowerGridEnv.what_if`."""
-        catalogue = self._asked_catalogue()
+        catalogue = self._topology_catalogue("a what-if is of topology actions")
         ids = None if actions is None else action_numbers(actions, len(catalogue))
         from rl2grid.engines.native.what_if import Moment, what_if
 
@@ -224,16 +231,11 @@ class TaskEnvironments:
 
     def first_safe(self, i: int, actions: Sequence[int]) -> FirstSafe:
         """Which of some actions to play; see :meth:`PowerGridEnv.first_safe`."""
-        catalogue = self._asked_catalogue()
+        catalogue = self._topology_catalogue("a what-if is of topology actions")
         ids = action_numbers(actions, len(catalogue))
         from rl2grid.engines.native.what_if import first_safe
 
         return first_safe(self._native_engine(i), i, catalogue, ids, float(SAFE_RHO))
-
-    def _asked_catalogue(self) -> ActionCatalogue:
-        if self._catalogue is None:
-            raise UsageError(f"{self.task.id} has continuous actions: a what-if is of topology actions.")
-        return self._catalogue
 
     def security(self, i: int) -> OutageOutcomes:
         """What the loss of each line would do now; see :meth:`PowerGridEnv.security`."""
@@ -243,9 +245,8 @@ class TaskEnvironments:
 
     def security_after(self, i: int, action: int) -> OutageOutcomes:
         """What the loss of each line would do after an action; see :meth:`PowerGridEnv.security`."""
-        if self._catalogue is None:
-            raise UsageError(f"{self.task.id} has continuous actions: N-1 after an action is of topology actions.")
-        played = self._catalogue[action_number(action, len(self._catalogue))]
+        catalogue = self._topology_catalogue("N-1 after an action is of topology actions")
+        played = catalogue[action_number(action, len(catalogue))]
         engine = self._native_engine(i)
         from rl2grid.engines.native.what_if import WhatIf
         from rl2grid.envs.outages_after_action import outages_after

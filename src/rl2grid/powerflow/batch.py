@@ -238,9 +238,8 @@ def solve_changes(address: int, order: I32) -> None:
     begin = 0
     n = order.shape[0]
     while begin < n:
-        kind, target = changes.kind[order[begin]], changes.target[order[begin]]
         end = begin + 1
-        while end < n and _go_together(kind, target, changes.kind[order[end]], changes.target[order[end]]):
+        while end < n and _go_together(changes, order[begin], order[end]):
             end += 1
         _solve_together(batch, has_base, order[begin:end])
         begin = end
@@ -268,10 +267,9 @@ def find_safe_change(address: int, limit: float, company: I32) -> int:
     best = 0
     for change in range(n):
         if outcomes.verdict[change] == UNASKED:
-            kind, target = changes.kind[change], changes.target[change]
             size = 0
             for other in range(change, n):
-                if _go_together(kind, target, changes.kind[other], changes.target[other]):
+                if _go_together(changes, change, other):
                     company[size] = other
                     size += 1
             _solve_together(batch, has_base, company[:size])
@@ -295,9 +293,11 @@ def _solve_base(batch: Batch) -> bool:
 
 
 @borrowing_jit
-def _go_together(kind: int, target: Index, other_kind: int, other_target: Index) -> bool:
+def _go_together(changes: Changes, one: Index, other: Index) -> bool:
     """Whether two changes share lanes: moves of one substation, switches of any lines."""
-    return other_kind == kind and (kind != MOVE or other_target == target)
+    if changes.kind[one] != changes.kind[other]:
+        return False
+    return bool(changes.kind[one] != MOVE or changes.target[one] == changes.target[other])
 
 
 @borrowing_jit

@@ -203,10 +203,10 @@ class WhatIf:
         self._write_snapshot(snapshot)
         if rho is not None:
             outcomes = new_outcomes(n, rho)
-            self._solve(_Room(Handle(changes), Handle(outcomes), np.zeros(0, np.int32)))
+            self._solve(Handle(changes), Handle(outcomes))
             return outcomes
         room = self._room_of(changes)
-        self._solve(room)
+        self._solve(room.changes, room.outcomes)
         return ChangeOutcomes._make(array.copy() for array in room.outcomes.structure)
 
     def _write_snapshot(self, snapshot: Snapshot) -> None:
@@ -224,14 +224,14 @@ class WhatIf:
         asked.kind[:], asked.target[:], asked.mask[:] = changes
         return room
 
-    def _solve(self, room: _Room) -> None:
+    def _solve(self, asked: Handle[Changes], outcomes: Handle[ChangeOutcomes]) -> None:
         """Write the outcomes of the changes."""
-        changes = room.changes.structure
+        changes = asked.structure
         order = np.lexsort((changes.target, -changes.kind)).astype(np.int32)
         parts = self._parts(order)
 
         def solve_part(k: int) -> None:
-            self._solvers[k].solve(room.changes, room.outcomes, parts[k])
+            self._solvers[k].solve(asked, outcomes, parts[k])
 
         if len(parts) == 1:
             solve_part(0)
