@@ -251,7 +251,7 @@ def snapshot_of(engine: NativeEngine, i: int) -> Snapshot:
     """
     if engine.state.terminated[i] or not engine.state.line_status[i].any():
         raise UsageError("Nothing can be asked after a game over or before a reset: reset the environment first.")
-    return _snapshot(engine.environments, i)
+    return _copied(_point_of(engine.environments, i))
 
 
 def forecast_of(engine: NativeEngine, i: int, horizon: int = 1) -> Snapshot | None:
@@ -265,7 +265,7 @@ def forecast_of(engine: NativeEngine, i: int, horizon: int = 1) -> Snapshot | No
         UsageError: after a game over, or without such a forecast.
     """
     foreseen = engine.foresee(i, horizon)
-    return None if foreseen is None else _snapshot(foreseen, 0)
+    return None if foreseen is None else _copied(_point_of(foreseen, 0))
 
 
 def what_if(
@@ -293,10 +293,10 @@ def first_safe(engine: NativeEngine, i: int, catalogue: ActionCatalogue, ids: Id
 
     Where the generators cannot follow the forecast, it is the first.
     """
-    snapshot = forecast_of(engine, i)
-    if snapshot is None:
+    foreseen = engine.foresee(i, 1)
+    if foreseen is None:
         return FirstSafe(0, np.inf, False)
-    return _solver_of(engine, 1).first_safe(snapshot, catalogue, ids, limit)
+    return _solver_of(engine, 1).first_safe(_point_of(foreseen, 0), catalogue, ids, limit)
 
 
 def outages(engine: NativeEngine, i: int) -> OutageOutcomes:
@@ -321,19 +321,24 @@ def _solver_of(engine: NativeEngine, num_threads: int) -> WhatIf:
 _SOLVERS: WeakKeyDictionary[NativeEngine, dict[int, WhatIf]] = WeakKeyDictionary()
 
 
-def _snapshot(environments: Environments, i: int) -> Snapshot:
+def _point_of(environments: Environments, i: int) -> Snapshot:
+    """The operating point of row ``i``, where it lies: it changes with the row."""
     state, hidden = environments.state, environments.hidden
     return Snapshot(
-        state.topo_vect[i].copy(),
-        hidden.last_bus[i].copy(),
-        state.time_before_cooldown_line[i].copy(),
-        state.time_before_cooldown_sub[i].copy(),
-        hidden.gen_p[i].copy(),
+        state.topo_vect[i],
+        hidden.last_bus[i],
+        state.time_before_cooldown_line[i],
+        state.time_before_cooldown_sub[i],
+        hidden.gen_p[i],
         hidden.gen_v[i].astype(np.float32),
-        hidden.load_p[i].copy(),
-        hidden.load_q[i].copy(),
-        state.storage_power[i].copy(),
+        hidden.load_p[i],
+        hidden.load_q[i],
+        state.storage_power[i],
     )
+
+
+def _copied(point: Snapshot) -> Snapshot:
+    return Snapshot._make(array.copy() for array in point)
 
 
 def _changes_of(catalogue: ActionCatalogue, ids: Ids | None) -> Changes:
@@ -342,12 +347,13 @@ def _changes_of(catalogue: ActionCatalogue, ids: Ids | None) -> Changes:
     Raises:
         UsageError: one of them changes no topology.
     """
+    kind, target, mask = catalogue.kind, catalogue.target, catalogue.mask
     if ids is not None:
-        catalogue = catalogue.take(ids)
-    kind = _KINDS[catalogue.kind]
+        kind, target, mask = kind[ids], target[ids], mask[ids]
+    kind = _KINDS[kind]
     if (kind < 0).any():
         raise UsageError("A what-if is for actions of kind NOTHING, MOVE and SWITCH; others have no topology.")
-    return Changes(kind, catalogue.target, catalogue.mask)
+    return Changes(kind, target, mask)
 
 
 def legal_changes(snapshot: Snapshot, changes: Changes) -> Flags:
