@@ -30,8 +30,8 @@ def open_line(state, line):
 def test_lines_above_their_limit_are_named(state):
     state.rho[1, [3, 17]] = 1.01
     state.rho[1, 4] = 1.0
-    assert overloaded_lines(state, 1) == "3 17"
-    assert overloaded_lines(state, 0) == ""
+    assert overloaded_lines(state.rho[1]) == "3 17"
+    assert overloaded_lines(state.rho[0]) == ""
 
 
 def test_a_whole_grid_has_nothing_cut_off(state):

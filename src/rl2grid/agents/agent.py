@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import gymnasium
@@ -37,6 +37,30 @@ class Agent(Protocol):
 
     def act(self, observation: Observation, info: Info) -> Action:
         """The action for an observation (float32, one axis) and the ``info`` that came with it."""
+
+
+@runtime_checkable
+class SideBySideAgent(Protocol):
+    """An agent that can decide for many environments of its task at once, as :meth:`Agent.act` does for each."""
+
+    decides_side_by_side: bool
+    """Whether it does, to the bit: an agent may be of a kind that can, and not be able to."""
+
+    def bind(self, env: gymnasium.Env[Any, Any]) -> None:
+        """See :meth:`Agent.bind`."""
+
+    def act_side_by_side(
+        self, observations: NDArray[np.float32], masks: Callable[[], NDArray[np.bool_]]
+    ) -> NDArray[Any]:
+        """The actions for observations.
+
+        Args:
+            observations: float32 [k, feature].
+            masks: which topology actions are legal, bool [k, action]; called where they matter.
+
+        Returns:
+            Integers [k], or float32 [k, continuous].
+        """
 
 
 @runtime_checkable

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium
+import numpy as np
+from numpy.typing import NDArray
 
 from rl2grid.agents.agent import Action, Info, Observation, no_intervention
 
@@ -14,6 +17,7 @@ class DoNothing:
     """Plays the action without effect at every decision."""
 
     name = "do-nothing"
+    decides_side_by_side = True
 
     def bind(self, env: gymnasium.Env[Any, Any]) -> None:
         """Remember which action changes nothing."""
@@ -25,3 +29,9 @@ class DoNothing:
     def act(self, observation: Observation, info: Info) -> Action:
         """The action without effect."""
         return copy.deepcopy(self._action)
+
+    def act_side_by_side(
+        self, observations: NDArray[np.float32], masks: Callable[[], NDArray[np.bool_]]
+    ) -> NDArray[Any]:
+        """The action without effect in every environment."""
+        return np.repeat(np.asarray(self._action)[np.newaxis], len(observations), axis=0)

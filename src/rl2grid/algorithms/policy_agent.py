@@ -5,16 +5,18 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from rl2grid.agents.agent import Action, Considered, Info, Observation
 from rl2grid.algorithms.checkpoint import load_checkpoint
+from rl2grid.algorithms.networks import find_network
 from rl2grid.algorithms.networks.mlp import freeze
 from rl2grid.algorithms.pretrained import PREFIX, is_pretrained, pretrained
 from rl2grid.algorithms.registry import find_algorithm
@@ -62,6 +64,7 @@ class PolicyAgent:
         ``heuristic``, unless the difference is what is studied."""
         self.deterministic = deterministic
         self._network = find_algorithm(contents["algorithm"]).load_policy(policy)
+        self._row_by_row = "factory" in policy and find_network(policy["factory"]["name"]).row_by_row
         self._mask_actions = bool(policy["mask_actions"])
         self._normalizer: ObservationNormalizer | None = None
         if policy["normalizer"] is not None:
@@ -125,6 +128,25 @@ class PolicyAgent:
         if self._network.continuous:
             return self._as_action(actions[0].clamp(-1.0, 1.0).numpy())
         return self._as_action(int(actions[0]))
+
+    @property
+    def decides_side_by_side(self) -> bool:
+        """Whether it decides for many environments as for each: samples are drawn for one episode, and not every
+        network gives the same beside others.
+        """
+        return self.deterministic and self._row_by_row
+
+    def act_side_by_side(
+        self, observations: NDArray[np.float32], masks: Callable[[], NDArray[np.bool_]]
+    ) -> NDArray[Any]:
+        """See :class:`~rl2grid.agents.agent.SideBySideAgent`."""
+        if self._normalizer is not None:
+            observations = self._normalizer.normalize(observations)
+        legal = torch.as_tensor(masks()) if self._mask_actions else None
+        with torch.no_grad():
+            actions: torch.Tensor = self._network.act(torch.as_tensor(observations, dtype=torch.float32), legal, None)
+        played: NDArray[Any] = (actions.clamp(-1.0, 1.0) if self._network.continuous else actions).numpy()
+        return played
 
     @property
     def continuous(self) -> bool:

@@ -63,9 +63,7 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
         (waiting,) = self._pending.nonzero()  # these rows return the ending that their reset has already played
         rows = np.delete(self._rows, waiting) if len(waiting) else self._rows
         self._pending[:] = False
-        self._note_decisions()
-        self._play(rows, decisions)
-        self._note_reached()
+        self._go_on(rows, decisions)
         effects = self._effects(decisions)
         if len(waiting):
             effects[waiting] = ""
@@ -79,6 +77,21 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
         batch = self._batch(effects, rewards, terminated, truncated)
         batch.infos |= endings
         return batch
+
+    def advance(self, rows: I64, actions: Any) -> None:
+        """Play one transition in each of ``rows``, whose episodes are not over; what ends is not begun anew.
+
+        Args:
+            rows: int64 [k], ascending.
+            actions: of all rows, as :meth:`step` takes them.
+
+        Raises:
+            UsageError: an action has the wrong shape or value, or a row was not reset yet; then no row has stepped.
+        """
+        for i in rows[~self._episodes.begun[rows]].tolist():
+            self._check_begun(i)
+        check_number(self.task, actions, self._n)
+        self._go_on(rows, self._decide(actions))
 
     def action_masks(self) -> NDArray[np.bool_]:
         """See :meth:`rl2grid.envs.rows.Rows.action_masks`."""
@@ -152,8 +165,14 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
         """The observations of all rows, float32 [n, feature]."""
 
     @abstractmethod
-    def _last_observations(self, rows: I64) -> NDArray[np.float32]:
+    def observations_of(self, rows: I64) -> NDArray[np.float32]:
         """The observations of ``rows``, which stay what they are, float32 [row, feature]."""
+
+    def _go_on(self, rows: I64, decisions: Decisions) -> None:
+        """Play one transition in each of ``rows``."""
+        self._note_decisions()
+        self._play(rows, decisions)
+        self._note_reached()
 
     def _begin(self, rows: I64, seeds: list[int | None] | None, options: dict[str, Any] | None) -> None:
         # All or none: no row may have begun when another's options are refused.
@@ -193,7 +212,7 @@ class EngineRows(TaskEnvironments, ABC, Generic[Decisions]):
         told = np.zeros(self._n, np.bool_)
         told[rows] = True
         observations = self._nothing.copy()
-        for i, observation in zip(rows.tolist(), self._last_observations(rows), strict=True):
+        for i, observation in zip(rows.tolist(), self.observations_of(rows), strict=True):
             observations[i] = observation
         report = self._report(rows)
         reasons = GAME_OVER_WORDS.take(report.counts[reports.GAME_OVER])

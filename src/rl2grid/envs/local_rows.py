@@ -39,7 +39,7 @@ class LocalRows(EngineRows[list[StepAction]]):
             self.write_observation(i, observations[i])
         return observations
 
-    def _last_observations(self, rows: I64) -> NDArray[np.float32]:
+    def observations_of(self, rows: I64) -> NDArray[np.float32]:
         observations = np.zeros((len(rows), self._size), np.float32)
         for i, observation in zip(rows.tolist(), observations, strict=True):
             self.write_observation(i, observation)

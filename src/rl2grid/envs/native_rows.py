@@ -101,7 +101,7 @@ class NativeRows(EngineRows[Commands]):
         self._write_observations(self._rows, self._buffers[0])
         return self._buffers[0]
 
-    def _last_observations(self, rows: I64) -> NDArray[np.float32]:
+    def observations_of(self, rows: I64) -> NDArray[np.float32]:
         self._write_observations(rows, self._last)
         return self._last[rows]
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from rl2grid.arrays import F32
 from rl2grid.mdp.state import GridState
 
 LIMIT = np.float32(1.0)
@@ -26,9 +27,9 @@ COMPLETED = Collapse()
 """Nothing collapsed."""
 
 
-def overloaded_lines(state: GridState, i: int) -> str:
-    """Ids of the lines of row ``i`` above their limit."""
-    return _ids(state.rho[i] > LIMIT)
+def overloaded_lines(loading: F32) -> str:
+    """Ids of the lines above their limit, of the loadings float32 [line]."""
+    return _ids(loading > LIMIT)
 
 
 def collapse(state: GridState, i: int, overloads: str) -> Collapse:

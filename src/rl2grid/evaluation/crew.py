@@ -31,7 +31,8 @@ from rl2grid.evaluation.episode import OnTransition, play_episode
 from rl2grid.processes import kill, take_standard_streams
 from rl2grid.records.episodes import Episode
 
-_REPORT_SECONDS = 0.5
+REPORT_SECONDS = 0.5
+"""Between two reports of how far running episodes are."""
 
 _WORKER = "from rl2grid.evaluation.crew import main; main()"
 """Not ``python -m``: what a worker sends must be of the classes of this module, not of a ``__main__``.
@@ -97,6 +98,8 @@ class Setting:
     """Not bound yet; workers play copies of it."""
     env_keywords: Mapping[str, Any] = field(default_factory=dict)
     """Keywords of ``gymnasium.make``."""
+    abreast: int = 1
+    """Episodes that this process plays at the same time, where it plays them."""
 
     def player(self) -> BoundAgent:
         """The agent, bound to an environment."""
@@ -145,7 +148,7 @@ class BoundAgent:
 
         def tell(action: Action, info: Info) -> None:
             nonlocal told
-            if time.monotonic() - told >= _REPORT_SECONDS:
+            if time.monotonic() - told >= REPORT_SECONDS:
                 told = time.monotonic()
                 on_progress(Progress(job, int(info["step"]), int(info["episode_length"])))
 
@@ -230,7 +233,7 @@ class WorkerCrew(Generic[Result]):
         while True:
             # With a time limit, so that an interrupt from the keyboard is noticed on every system.
             try:
-                return self._answers.get(timeout=_REPORT_SECONDS)
+                return self._answers.get(timeout=REPORT_SECONDS)
             except queue.Empty:
                 continue
 

@@ -5,14 +5,15 @@ from __future__ import annotations
 import time
 import zlib
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import gymnasium
 
 from rl2grid.agents.agent import Action, Agent, Info, RandomizedAgent, no_intervention
+from rl2grid.envs.operation import Operation
 from rl2grid.errors import UsageError
-from rl2grid.evaluation.collapse import COMPLETED, collapse, overloaded_lines
+from rl2grid.evaluation.collapse import COMPLETED, Collapse, collapse, overloaded_lines
 from rl2grid.mdp.constraint_table import CONSTRAINTS
 from rl2grid.mdp.termination import GameOver
 from rl2grid.records.episodes import Episode
@@ -22,6 +23,26 @@ OnDecision = Callable[[Action, Info], None]
 OnTransition = Callable[[bool, bool, Info], None]
 """Called with what came of every action of the agent: whether the episode was lost, whether it was completed, and the
 ``info`` after it."""
+
+
+TOTALS = (
+    *("episode_return", "return_survive", "return_overload", "return_cost"),
+    *(constraint.column for constraint in CONSTRAINTS.values()),
+)
+"""Columns of an episode that are sums over its transitions: reward, its components, costs."""
+
+
+@dataclass
+class Tally:
+    """What is added up while an episode is played."""
+
+    totals: dict[str, Any] = field(default_factory=lambda: dict.fromkeys(TOTALS, 0.0))
+    """By name of :data:`TOTALS`, what was played before the first decision included."""
+    decisions: int = 0
+    illegal: int = 0
+    ambiguous: int = 0
+    seconds: float = 0.0
+    """It took."""
 
 
 def play_episode(
@@ -62,20 +83,19 @@ def play_episode(
     options = {"scenario": scenario, "start": start}
     observation, info = env.reset(seed=environment_seed(scenario, seed), options=options)
     agent.reset(0)
-    totals: dict[str, Any] = dict.fromkeys((*_TOTALS, *(each.column for each in CONSTRAINTS.values())), 0.0)
-    _add(totals, float(info["reset_reward"]), info["reset_components"], info["reset_costs"])
-    decisions = illegal = ambiguous = 0
+    tally = Tally()
+    _add(tally.totals, float(info["reset_reward"]), info["reset_components"], info["reset_costs"])
     over = False
     played: Any = env.unwrapped
     state = played.state
     while not over:
         # The agent is only asked where the heuristic is not at ease, so that a game over in a later step of the
         # transition, or inside the reset, comes from a state without overloads.
-        decided, overloads = info["step"], overloaded_lines(state, 0)
+        decided, overloads = info["step"], overloaded_lines(state.rho[0])
         asked = not info["over"]
         if asked:
             action = agent.act(observation, info)
-            decisions += 1
+            tally.decisions += 1
             if played.imagined:
                 raise UsageError(
                     f"{agent.name} left the environment in an imagined world: restore the true one before acting."
@@ -88,41 +108,57 @@ def play_episode(
         over = terminated or truncated
         if asked and on_transition is not None:
             on_transition(bool(terminated), bool(truncated), info)
-        _add(totals, float(reward), info["reward_components"], info["costs"])
-        illegal += int(info["illegal"])
-        ambiguous += int(info["ambiguous"])
-    ending = collapse(state, 0, overloads if info["step"] == decided + 1 else "") if terminated else COMPLETED
+        _add(tally.totals, float(reward), info["reward_components"], info["costs"])
+        tally.illegal += int(info["illegal"])
+        tally.ambiguous += int(info["ambiguous"])
+    ending = collapse(state, 0, overloads if info["step"] == decided + 1 else "") if terminated else None
+    tally.seconds = time.perf_counter() - began
+    return episode_of(scenario, seed, info, tally, ending, played.operation(), played.foresight)
+
+
+def episode_of(
+    scenario: str, seed: int, info: Info, tally: Tally, ending: Collapse | None, operation: Operation, foresight: int
+) -> Episode:
+    """The row of an episode that is over, without the labels of an evaluation.
+
+    Args:
+        scenario: id of the scenario.
+        seed: see :func:`play_episode`.
+        info: the last one.
+        tally: what was added up.
+        ending: where the grid was hurt; None: the episode was completed.
+        operation: what the episode cost.
+        foresight: decisions that were taken where the truth had been seen before.
+    """
+    hurt = COMPLETED if ending is None else ending
     return Episode(
         scenario=scenario,
         seed=seed,
         start=int(info["start"]),
         episode_length=int(info["episode_length"]),
         grid_steps=int(info["step"]),
-        decisions=decisions,
+        decisions=tally.decisions,
         survival=float(info["survival"]),
-        completed=not terminated,
+        completed=ending is None,
         game_over=GameOver(info["game_over"]).name,
         score_margin=float(info["scores"]["margin"]),
         score_overload=float(info["scores"]["overload"]),
         score_topology=float(info["scores"]["topology"]),
-        illegal=illegal,
-        ambiguous=ambiguous,
-        foresight=played.foresight,
-        wall_time_s=round(time.perf_counter() - began, 4),
-        last_overloads=ending.last_overloads,
-        last_outages=ending.last_outages,
-        last_cut_off=ending.last_cut_off,
-        **asdict(played.operation()),
-        **totals,
+        illegal=tally.illegal,
+        ambiguous=tally.ambiguous,
+        foresight=foresight,
+        wall_time_s=round(tally.seconds, 4),
+        last_overloads=hurt.last_overloads,
+        last_outages=hurt.last_outages,
+        last_cut_off=hurt.last_cut_off,
+        **asdict(operation),
+        **tally.totals,
     )
 
 
 def environment_seed(scenario: str, seed: int) -> int:
     """The seed that the environment is reset with: months that are played with one seed share no attack or outage."""
     return (zlib.crc32(scenario.encode()) << 31) + seed
-
-
-_TOTALS = ("episode_return", "return_survive", "return_overload", "return_cost")
 
 
 def _add(totals: dict[str, Any], reward: float, components: dict[str, float], costs: dict[str, float]) -> None:

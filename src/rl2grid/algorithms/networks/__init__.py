@@ -140,6 +140,9 @@ class Network:
     from them may not."""
     needs_grid: bool = False
     """Whether it is for tasks of rl2grid alone, whose ``Spec`` has a grid."""
+    row_by_row: bool = False
+    """Whether what it gives for a row is the same to the bit, whatever rows are beside it: its policies then play the
+    episodes of an evaluation side by side."""
 
 
 @runtime_checkable

@@ -188,4 +188,4 @@ def freeze(network: nn.Module) -> None:
             module.freeze()
 
 
-NETWORK = Network("mlp", build)
+NETWORK = Network("mlp", build, row_by_row=True)

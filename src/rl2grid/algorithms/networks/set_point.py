@@ -209,4 +209,4 @@ def make(request: Request) -> nn.Module:
     return SetPoints(request, actions, 0)
 
 
-NETWORK = Network(NAME, make, reads_normalized=False, needs_grid=True)
+NETWORK = Network(NAME, make, reads_normalized=False, needs_grid=True, row_by_row=True)

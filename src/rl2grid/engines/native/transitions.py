@@ -109,7 +109,7 @@ class Commands:
         return self if stop - start == len(self) else self._only(part)
 
     def take(self, rows: I64) -> Commands:
-        """The entries ``rows``."""
+        """The entries ``rows``, which ascend."""
         return self if len(rows) == len(self) else self._only(rows)
 
     def _only(self, entries: slice | I64) -> Commands:

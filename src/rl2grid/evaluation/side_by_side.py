@@ -1,0 +1,166 @@
+"""Plays the episodes of an evaluation side by side: all rows of the native engine in one call, all decisions in one.
+
+What is played is what :func:`rl2grid.evaluation.episode.play_episode` plays of each episode, to the bit.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator, Sequence
+from types import TracebackType
+from typing import Any, Self
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from rl2grid.agents.agent import Agent, SideBySideAgent, no_intervention
+from rl2grid.arrays import I64
+from rl2grid.envs.native_rows import NativeRows
+from rl2grid.envs.options import TaskOptions
+from rl2grid.envs.registration import register_all
+from rl2grid.envs.tasks import Task, find_task
+from rl2grid.evaluation.collapse import collapse, overloaded_lines
+from rl2grid.evaluation.crew import REPORT_SECONDS, Crew, Job, OnProgress, Progress, Setting, make_crew
+from rl2grid.evaluation.episode import TOTALS, Tally, environment_seed, episode_of
+from rl2grid.records.episodes import Episode
+
+_ABREAST = 32
+"""Episodes that are under way at the same time where many can be."""
+
+
+def find_crew(setting: Setting, workers: int) -> Crew[Episode]:
+    """Who plays the episodes: worker processes, or this one, one after the other or side by side."""
+    return make_crew(setting, workers) if workers or setting.abreast == 1 else SideBySideCrew(setting)
+
+
+def episodes_abreast(task: Task, agent: Agent, options: TaskOptions) -> int:
+    """How many episodes one process plays at a time.
+
+    More than one if the agent decides for many environments at once and compiled code steps them.
+    """
+    is_compiled = options.engine == "native" and not callable(options.reward)
+    return _ABREAST if is_compiled and task.kind != "H" and _decides_side_by_side(agent) else 1
+
+
+def _decides_side_by_side(agent: Agent) -> bool:
+    """Whether it does, and not by inheritance from an agent that acts otherwise, or by a word for another."""
+    if "act" in getattr(agent, "__dict__", ()):
+        return False
+    ways = ("act_side_by_side", "act")
+    first = next((way for kind in type(agent).__mro__ for way in ways if way in vars(kind)), None)
+    return first == ways[0] and isinstance(agent, SideBySideAgent) and agent.decides_side_by_side
+
+
+class SideBySideCrew:
+    """Plays in this process, many episodes at a time."""
+
+    def __init__(self, setting: Setting) -> None:
+        self._setting = setting
+        self._rows: NativeRows | None = None
+
+    def play(self, jobs: Sequence[Job], on_progress: OnProgress) -> Iterator[tuple[Job, Episode]]:
+        """See :class:`~rl2grid.evaluation.crew.Crew`."""
+        task, keywords = self._setting.task, self._setting.env_keywords
+        register_all()
+        env = gymnasium.make(task, disable_env_checker=True, **keywords)
+        try:
+            self._setting.agent.bind(env)
+        finally:
+            env.close()
+        n = min(len(jobs), self._setting.abreast)
+        self._rows = NativeRows(find_task(task), TaskOptions(**keywords), n, os.cpu_count())
+        table = _Table(self._setting.agent, self._rows, no_intervention(env.action_space), n)
+        yield from table.play(jobs, on_progress)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._rows is not None:
+            self._rows.close()
+
+
+class _Table:
+    """The episodes that are under way, a row each."""
+
+    def __init__(self, agent: Any, rows: NativeRows, nothing: Any, n: int) -> None:
+        self._agent, self._rows, self._state = agent, rows, rows.state
+        self._actions: NDArray[Any] = np.repeat(np.asarray(nothing)[np.newaxis], n, axis=0)
+        self._jobs: dict[int, Job] = {}
+        self._steps, self._loadings = np.zeros(n, np.int64), np.zeros_like(self._state.rho)  # before the last decision
+        self._totals = np.zeros((n, len(TOTALS)))
+        self._counts = np.zeros((n, 3), np.int64)  # decisions, those that were illegal, and ambiguous
+        self._seconds = np.zeros(n)
+
+    def play(self, jobs: Sequence[Job], on_progress: OnProgress) -> Iterator[tuple[Job, Episode]]:
+        """Play all of them, each as soon as a row is free."""
+        waiting = list(reversed(jobs))
+        for i in range(len(self._actions)):
+            yield from self._fill(i, waiting)
+        told = time.monotonic()
+        while self._jobs:
+            rows = np.array(sorted(self._jobs))
+            self._step(rows)
+            over = self._state.terminated[rows] | self._state.truncated[rows]
+            for i in rows[over].tolist():
+                yield self._finish(i)
+                yield from self._fill(i, waiting)
+            if time.monotonic() - told >= REPORT_SECONDS:
+                told = time.monotonic()
+                self._tell(on_progress)
+
+    def _fill(self, i: int, waiting: list[Job]) -> Iterator[tuple[Job, Episode]]:
+        """Begin the next episode in row ``i``; one that ends before its first decision is told of at once."""
+        while waiting:
+            self._begin(i, waiting.pop())
+            if not self._rows.is_over(i):
+                return
+            yield self._finish(i)
+
+    def _begin(self, i: int, job: Job) -> None:
+        """Begin an episode in row ``i``."""
+        began = time.perf_counter()
+        self._rows.begin(i, environment_seed(job.scenario, job.seed), {"scenario": job.scenario, "start": job.start})
+        self._jobs[i] = job
+        state = self._state
+        self._totals[i] = (state.reset_reward[i], *state.reset_components[i], *state.reset_costs[i])
+        self._counts[i] = 0
+        self._steps[i] = state.step[i]
+        self._seconds[i] = time.perf_counter() - began
+
+    def _step(self, rows: I64) -> None:
+        """Decide and play a transition in each of ``rows``."""
+        began = time.perf_counter()
+        state = self._state
+        self._steps[rows], self._loadings[rows] = state.step[rows], state.rho[rows]
+        observations = self._rows.observations_of(rows)
+        self._actions[rows] = self._agent.act_side_by_side(observations, lambda: self._rows.action_masks()[rows])
+        self._rows.advance(rows, self._actions)
+        self._totals[rows, 0] += state.transition_reward[rows]
+        self._totals[rows, 1:] += np.hstack((state.transition_components[rows], state.transition_costs[rows]))
+        self._counts[rows, 0] += 1
+        self._counts[rows, 1] += state.illegal[rows]
+        self._counts[rows, 2] += state.ambiguous[rows]
+        self._seconds[rows] += (time.perf_counter() - began) / len(rows)
+
+    def _finish(self, i: int) -> tuple[Job, Episode]:
+        """The episode of row ``i``, which is over."""
+        job, state = self._jobs.pop(i), self._state
+        totals = dict(zip(TOTALS, self._totals[i].tolist(), strict=True))
+        decisions, illegal, ambiguous = self._counts[i].tolist()
+        tally = Tally(totals, decisions, illegal, ambiguous, float(self._seconds[i]))
+        # A later step of a transition comes from a state at which the heuristic was at ease.
+        overloads = overloaded_lines(self._loadings[i]) if state.step[i] == self._steps[i] + 1 else ""
+        ending = collapse(state, i, overloads) if state.terminated[i] else None
+        foresight = int(self._rows.foresight[i])
+        info, operation = self._rows.info(i), self._rows.operation(i)
+        return job, episode_of(job.scenario, job.seed, info, tally, ending, operation, foresight)
+
+    def _tell(self, on_progress: OnProgress) -> None:
+        """How far all episodes are."""
+        for i, job in self._jobs.items():
+            on_progress(Progress(job, int(self._state.step[i]), int(self._state.episode_length[i])))
