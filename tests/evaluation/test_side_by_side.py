@@ -39,10 +39,13 @@ def setting_of(agent: Agent, task: str, heuristic: str | None, **options: Any) -
     [
         ("do-nothing", "bus14-T0", None, 600),
         ("do-nothing", "bus118-MOB-v0-R", "idle", 300),
-        ("pretrained/bus14-T0", "bus14-T0", None, 300),
-        ("pretrained/bus14-R", "bus14-R", None, 150),
+        ("pretrained/bus14-T0", "bus14-T0", None, 150),
+        ("pretrained/bus14-R", "bus14-R", None, 80),
         ("pretrained/bus14-R", "bus14-R", "recovery", 1500),
         ("pretrained/bus36-MO-v0-T1", "bus36-MO-v0-T1", "careful", 600),
+        ("do-nothing", "bus14-H0", None, 600),
+        ("pretrained/bus14-H1", "bus14-H1", "recovery", 500),
+        ("pretrained/bus36-MO-v0-H1", "bus36-MO-v0-H1", None, 60),
     ],
 )
 def test_rows_are_those_of_single_environments(agent: str, task: str, heuristic: str | None, steps: int) -> None:
@@ -102,8 +105,8 @@ class Wrapped:
 
 def test_only_who_decides_for_many_as_for_each_plays_side_by_side() -> None:
     task, options = find_task("bus14-T0"), TaskOptions(heuristic="idle")
-    assert episodes_abreast(task, DoNothing(), options) > 1
-    assert episodes_abreast(task, load_agent(Path("pretrained/bus14-T0")), options) > 1
+    assert episodes_abreast(DoNothing(), options) > 1
+    assert episodes_abreast(load_agent(Path("pretrained/bus14-T0")), options) > 1
     others: list[Any] = [
         RandomAgent(),
         Stubborn(),
@@ -114,10 +117,9 @@ def test_only_who_decides_for_many_as_for_each_plays_side_by_side() -> None:
     ]
     replaced = DoNothing()
     replaced.act = lambda observation, info: 1  # type: ignore[method-assign]
-    assert [episodes_abreast(task, agent, options) for agent in (*others, replaced)] == [1] * 7
+    assert [episodes_abreast(agent, options) for agent in (*others, replaced)] == [1] * 7
     for slow in (TaskOptions(engine="reference"), TaskOptions(reward=lambda *_: 0.0)):
-        assert episodes_abreast(task, DoNothing(), slow) == 1
-    assert episodes_abreast(find_task("bus14-H0"), DoNothing(), options) == 1
+        assert episodes_abreast(DoNothing(), slow) == 1
 
 
 def test_an_evaluation_is_the_same_whoever_plays_it() -> None:

@@ -15,6 +15,8 @@ Observation = NDArray[np.float32]
 Action = Any
 """``int`` on topology tasks (Discrete), float32 [continuous] in [-1, 1] on redispatching tasks (Box), a dict of both,
 ``topology`` and ``injection``, on joint tasks (Dict)."""
+Actions = Any
+"""Of many environments: integers [k], float32 [k, continuous], or a dict of both."""
 Info = Mapping[str, Any]
 
 
@@ -49,17 +51,12 @@ class SideBySideAgent(Protocol):
     def bind(self, env: gymnasium.Env[Any, Any]) -> None:
         """See :meth:`Agent.bind`."""
 
-    def act_side_by_side(
-        self, observations: NDArray[np.float32], masks: Callable[[], NDArray[np.bool_]]
-    ) -> NDArray[Any]:
+    def act_side_by_side(self, observations: NDArray[np.float32], masks: Callable[[], NDArray[np.bool_]]) -> Actions:
         """The actions for observations.
 
         Args:
             observations: float32 [k, feature].
             masks: which topology actions are legal, bool [k, action]; called where they matter.
-
-        Returns:
-            Integers [k], or float32 [k, continuous].
         """
 
 
@@ -166,6 +163,13 @@ def no_intervention(space: gymnasium.Space[Any]) -> Action:
         return 0
     assert isinstance(space, gymnasium.spaces.Box)
     return np.zeros(space.shape, space.dtype)
+
+
+def repeated(action: Action, n: int) -> Actions:
+    """The same action for ``n`` environments."""
+    if isinstance(action, Mapping):
+        return {name: repeated(part, n) for name, part in action.items()}
+    return np.repeat(np.asarray(action)[np.newaxis], n, axis=0)
 
 
 def intervenes(action: Action) -> bool:

@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from rl2grid.agents.agent import Action, Info, Observation, no_intervention
+from rl2grid.agents.agent import Action, Actions, Info, Observation, no_intervention, repeated
 
 
 class DoNothing:
@@ -30,8 +30,6 @@ class DoNothing:
         """The action without effect."""
         return copy.deepcopy(self._action)
 
-    def act_side_by_side(
-        self, observations: NDArray[np.float32], masks: Callable[[], NDArray[np.bool_]]
-    ) -> NDArray[Any]:
+    def act_side_by_side(self, observations: NDArray[np.float32], masks: Callable[[], NDArray[np.bool_]]) -> Actions:
         """The action without effect in every environment."""
-        return np.repeat(np.asarray(self._action)[np.newaxis], len(observations), axis=0)
+        return repeated(self._action, len(observations))

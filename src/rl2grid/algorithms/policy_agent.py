@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from rl2grid.agents.agent import Action, Considered, Info, Observation
+from rl2grid.agents.agent import Action, Actions, Considered, Info, Observation
 from rl2grid.algorithms.checkpoint import load_checkpoint
 from rl2grid.algorithms.networks import find_network
 from rl2grid.algorithms.networks.mlp import freeze
@@ -136,17 +136,19 @@ class PolicyAgent:
         """
         return self.deterministic and self._row_by_row
 
-    def act_side_by_side(
-        self, observations: NDArray[np.float32], masks: Callable[[], NDArray[np.bool_]]
-    ) -> NDArray[Any]:
+    def act_side_by_side(self, observations: NDArray[np.float32], masks: Callable[[], NDArray[np.bool_]]) -> Actions:
         """See :class:`~rl2grid.agents.agent.SideBySideAgent`."""
         if self._normalizer is not None:
             observations = self._normalizer.normalize(observations)
-        legal = torch.as_tensor(masks()) if self._mask_actions else None
+        legal = torch.as_tensor(self._extended(masks())) if self._mask_actions else None
         with torch.no_grad():
             actions: torch.Tensor = self._network.act(torch.as_tensor(observations, dtype=torch.float32), legal, None)
-        played: NDArray[Any] = (actions.clamp(-1.0, 1.0) if self._network.continuous else actions).numpy()
-        return played
+        played = (actions.clamp(-1.0, 1.0) if self._network.continuous else actions).numpy()
+        return played if self._flattened is None else _joined([self._flattened.action(each) for each in played])
+
+    def _extended(self, masks: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Masks of topology actions as those of all actions that it knows, bool [k, action]."""
+        return self._flattened.extended(masks) if isinstance(self._flattened, JointAsDiscrete) else masks
 
     @property
     def continuous(self) -> bool:
@@ -216,6 +218,11 @@ def _flattened(env: gymnasium.Env[Any, Any], continuous: bool) -> JointAsBox | J
     if not isinstance(env.action_space, gymnasium.spaces.Dict):
         return None
     return JointAsBox(env) if continuous else JointAsDiscrete(env)
+
+
+def _joined(actions: Sequence[Mapping[str, Any]]) -> dict[str, NDArray[Any]]:
+    """Joint actions, one of each environment, as one of all."""
+    return {name: np.array([action[name] for action in actions]) for name in actions[0]}
 
 
 def load_agent(

@@ -104,7 +104,11 @@ class JointAsDiscrete(_Joint):
     def action_masks(self) -> Flags:
         """Which actions are legal now, bool [action]; controls may always be moved."""
         base: Any = self.env.unwrapped
-        return np.concatenate((base.action_masks(), np.ones(len(self._moves), np.bool_)))
+        return self.extended(base.action_masks())
+
+    def extended(self, masks: Flags) -> Flags:
+        """Masks of topology actions, bool [..., topology action], as those of all actions, bool [..., action]."""
+        return np.concatenate((masks, np.ones((*masks.shape[:-1], len(self._moves)), np.bool_)), axis=-1)
 
 
 class _VectorJoint(VectorActionWrapper):

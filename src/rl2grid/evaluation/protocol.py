@@ -104,7 +104,7 @@ def evaluate(
     jobs = _jobs(chosen_scenarios, seeds, start)
     _check_lengths(task, chosen_scenarios, start, keywords.get("episode_length"))
     checked = TaskOptions(**keywords)
-    abreast = episodes_abreast(task, chosen, checked)
+    abreast = episodes_abreast(chosen, checked)
     processes = _number_of_workers(workers, checked.engine, agent, len(jobs), abreast)
     if output is not None:
         check_folder(output)  # before months are made, which takes minutes

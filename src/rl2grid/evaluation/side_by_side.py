@@ -13,14 +13,13 @@ from typing import Any, Self
 
 import gymnasium
 import numpy as np
-from numpy.typing import NDArray
 
-from rl2grid.agents.agent import Agent, SideBySideAgent, no_intervention
+from rl2grid.agents.agent import Actions, Agent, SideBySideAgent, no_intervention, repeated
 from rl2grid.arrays import I64
 from rl2grid.envs.native_rows import NativeRows
 from rl2grid.envs.options import TaskOptions
 from rl2grid.envs.registration import register_all
-from rl2grid.envs.tasks import Task, find_task
+from rl2grid.envs.tasks import find_task
 from rl2grid.evaluation.collapse import collapse, overloaded_lines
 from rl2grid.evaluation.crew import REPORT_SECONDS, Crew, Job, OnProgress, Progress, Setting, make_crew
 from rl2grid.evaluation.episode import TOTALS, Tally, environment_seed, episode_of
@@ -35,13 +34,13 @@ def find_crew(setting: Setting, workers: int) -> Crew[Episode]:
     return make_crew(setting, workers) if workers or setting.abreast == 1 else SideBySideCrew(setting)
 
 
-def episodes_abreast(task: Task, agent: Agent, options: TaskOptions) -> int:
+def episodes_abreast(agent: Agent, options: TaskOptions) -> int:
     """How many episodes one process plays at a time.
 
     More than one if the agent decides for many environments at once and compiled code steps them.
     """
     is_compiled = options.engine == "native" and not callable(options.reward)
-    return _ABREAST if is_compiled and task.kind != "H" and _decides_side_by_side(agent) else 1
+    return _ABREAST if is_compiled and _decides_side_by_side(agent) else 1
 
 
 def _decides_side_by_side(agent: Agent) -> bool:
@@ -71,7 +70,7 @@ class SideBySideCrew:
             env.close()
         n = min(len(jobs), self._setting.abreast)
         self._rows = NativeRows(find_task(task), TaskOptions(**keywords), n, os.cpu_count())
-        table = _Table(self._setting.agent, self._rows, no_intervention(env.action_space), n)
+        table = _Table(self._setting.agent, self._rows, repeated(no_intervention(env.action_space), n), n)
         yield from table.play(jobs, on_progress)
 
     def __enter__(self) -> Self:
@@ -87,9 +86,8 @@ class SideBySideCrew:
 class _Table:
     """The episodes that are under way, a row each."""
 
-    def __init__(self, agent: Any, rows: NativeRows, nothing: Any, n: int) -> None:
-        self._agent, self._rows, self._state = agent, rows, rows.state
-        self._actions: NDArray[Any] = np.repeat(np.asarray(nothing)[np.newaxis], n, axis=0)
+    def __init__(self, agent: Any, rows: NativeRows, actions: Actions, n: int) -> None:
+        self._agent, self._rows, self._state, self._actions = agent, rows, rows.state, actions
         self._jobs: dict[int, Job] = {}
         self._steps, self._loadings = np.zeros(n, np.int64), np.zeros_like(self._state.rho)  # before the last decision
         self._totals = np.zeros((n, len(TOTALS)))
@@ -99,7 +97,7 @@ class _Table:
     def play(self, jobs: Sequence[Job], on_progress: OnProgress) -> Iterator[tuple[Job, Episode]]:
         """Play all of them, each as soon as a row is free."""
         waiting = list(reversed(jobs))
-        for i in range(len(self._actions)):
+        for i in range(len(self._seconds)):
             yield from self._fill(i, waiting)
         told = time.monotonic()
         while self._jobs:
@@ -138,7 +136,7 @@ class _Table:
         state = self._state
         self._steps[rows], self._loadings[rows] = state.step[rows], state.rho[rows]
         observations = self._rows.observations_of(rows)
-        self._actions[rows] = self._agent.act_side_by_side(observations, lambda: self._rows.action_masks()[rows])
+        _put(self._actions, rows, self._agent.act_side_by_side(observations, lambda: self._rows.action_masks()[rows]))
         self._rows.advance(rows, self._actions)
         self._totals[rows, 0] += state.transition_reward[rows]
         self._totals[rows, 1:] += np.hstack((state.transition_components[rows], state.transition_costs[rows]))
@@ -164,3 +162,12 @@ class _Table:
         """How far all episodes are."""
         for i, job in self._jobs.items():
             on_progress(Progress(job, int(self._state.step[i]), int(self._state.episode_length[i])))
+
+
+def _put(all_actions: Actions, rows: I64, actions: Actions) -> None:
+    """Write the actions of ``rows`` to those of all."""
+    if isinstance(all_actions, dict):
+        for name, part in all_actions.items():
+            part[rows] = actions[name]
+        return
+    all_actions[rows] = actions
