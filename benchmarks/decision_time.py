@@ -39,7 +39,7 @@ RESULTS = Path(__file__).resolve().parent / "results" / "decision_time.json"
 
 def row_of(agent: Agent, task: Task, heuristic: str | None, months: tuple[str, ...]) -> dict[str, Any]:
     """Play, and say what decisions took; the first month was played once before, so that nothing has to be loaded."""
-    evaluate(agent, task, scenarios=months[:1], heuristic=heuristic, workers=0)
+    evaluate(Timed(agent), task, scenarios=months[:1], heuristic=heuristic, workers=0)
     timed = Timed(agent)
     played = evaluate(timed, task, scenarios=months, heuristic=heuristic, workers=0, progress=True)
     milliseconds = 1e3 * np.array(timed.seconds)
