@@ -20,8 +20,8 @@ from typing import Any, NamedTuple
 from rl2grid.envs.tasks import find_task
 from rl2grid.evaluation import protocol
 from rl2grid.evaluation.agents import make_agent
-from rl2grid.evaluation.crew import Crew, Setting, make_crew
-from rl2grid.evaluation.side_by_side import find_crew
+from rl2grid.evaluation.crew import Crew, make_crew
+from rl2grid.evaluation.setting import Setting
 from rl2grid.records.episodes import Episode
 from rl2grid.records.evaluations import Evaluation
 from rl2grid.records.files import write_json
@@ -58,7 +58,7 @@ CASES = (
 
 def one_after_the_other(setting: Setting, workers: int) -> Crew[Episode]:
     """As agents that decide for one environment are played."""
-    return make_crew(setting, workers)
+    return make_crew(replace(setting, abreast=1), workers)
 
 
 def play(case: Case) -> Evaluation:
@@ -69,12 +69,12 @@ def play(case: Case) -> Evaluation:
 
 def measure(case: Case, rounds: int) -> dict[str, Any]:
     """Both ways in turn."""
-    ways = {"alone": one_after_the_other, "side by side": find_crew}
+    ways = {"alone": one_after_the_other, "side by side": make_crew}
     seconds: dict[str, list[float]] = {name: [] for name in ways}
     rows: dict[str, list[Episode]] = {}
     for number in range(rounds + 1):
         for name, way in ways.items():
-            protocol.find_crew = way
+            protocol.make_crew = way
             began = time.perf_counter()
             episodes = play(case).episodes
             if number:

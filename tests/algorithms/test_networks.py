@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 import rl2grid
 from rl2grid.algorithms import networks
+from rl2grid.algorithms.dqn import QNetwork
 from rl2grid.algorithms.hyperparameters import identifying
 from rl2grid.algorithms.networks import (
     PER_ACTION,
@@ -32,8 +33,11 @@ from rl2grid.algorithms.networks import (
     network_names,
     register_network,
 )
-from rl2grid.algorithms.networks.mlp import Layers
+from rl2grid.algorithms.networks.mlp import Layers, freeze
+from rl2grid.algorithms.on_policy import ActorCritic
 from rl2grid.algorithms.registry import find_algorithm
+from rl2grid.algorithms.sac import CategoricalActor, GaussianActor
+from rl2grid.algorithms.td3 import Actor
 from rl2grid.dense.choices import NEVER
 from rl2grid.envs.registration import register_all
 from rl2grid.envs.spec import Spec, task_spec
@@ -314,6 +318,46 @@ def test_frozen_layers_give_the_same_bits_and_learn_no_more(batch: int):
     mixed.freeze()
     with torch.no_grad():
         assert torch.equal(mixed(torch.ones(1, 3)), expected)
+
+
+@pytest.mark.parametrize(
+    ("name", "task", "shortlist"),
+    [
+        ("mlp", "bus14-T0", None),
+        ("mlp", "bus14-T0", 20),
+        ("mlp", "bus36-M-R", None),
+        ("set-point", "bus36-M-R", None),
+    ],
+)
+def test_policies_whose_network_says_so_decide_the_same_beside_others(name: str, task: str, shortlist: int | None):
+    spec = task_spec(find_task(task))
+    assert find_network(name).row_by_row
+
+    def factory() -> NetworkFactory:
+        return NetworkFactory(spec, name, torch.Generator().manual_seed(1), shortlist)
+
+    layers: dict[str, Any] = {"layers": (64, 64)}
+    policies: list[Any] = [ActorCritic(factory(), actor_layers=(64, 64), critic_layers=(8,))]
+    if spec.continuous:
+        policies.append(Actor(factory(), **layers))
+        policies += [GaussianActor(factory(), **layers)] if name == "mlp" else []
+    else:
+        policies += [CategoricalActor(factory(), **layers), QNetwork(factory(), **layers)]
+        policies += [QNetwork(factory(), head="dueling", **layers)] if shortlist is None else []
+    observations = torch.randn(33, spec.observation_size, generator=torch.Generator().manual_seed(2))
+    masks = None if spec.continuous else torch.ones(33, spec.action_size, dtype=torch.bool)
+    for policy in policies:
+        freeze(policy)
+        say = policy.act if spec.continuous else lambda rows, legal, _, policy=policy: policy.preferences(rows, legal)
+        with torch.no_grad():
+            together = say(observations, masks, None)
+            alone = [say(observations[k : k + 1], None if masks is None else masks[k : k + 1], None) for k in range(33)]
+        assert torch.equal(together, torch.cat(alone)), type(policy).__name__
+
+
+def test_networks_of_ones_own_are_not_taken_for_such():
+    assert not Network("own", Lines).row_by_row
+    assert not any(find_network(name).row_by_row for name in ("gnn", "action-embedding"))
 
 
 def test_second_derivatives_are_refused():

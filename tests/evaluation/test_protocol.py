@@ -27,10 +27,10 @@ from rl2grid.engines import ENGINES
 from rl2grid.envs.registration import register_all
 from rl2grid.errors import UsageError
 from rl2grid.evaluation import protocol as evaluation
-from rl2grid.evaluation.crew import Job, Setting
+from rl2grid.evaluation.crew import Job, make_crew
 from rl2grid.evaluation.episode import environment_seed, play_episode
 from rl2grid.evaluation.protocol import evaluate, run_evaluation
-from rl2grid.evaluation.side_by_side import find_crew
+from rl2grid.evaluation.setting import Setting
 from rl2grid.grids import GRID_IDS
 from rl2grid.records.episodes import EPISODES_FILE, Episode
 from rl2grid.records.evaluation_folder import PARTIAL_FILE
@@ -457,9 +457,9 @@ def test_the_policy_played_is_the_one_whose_hash_is_stored(checkpoint, tmp_path,
 
     def replaced(*arguments):
         path.write_bytes(b"another policy")
-        return find_crew(*arguments)
+        return make_crew(*arguments)
 
-    monkeypatch.setattr(evaluation, "find_crew", replaced)
+    monkeypatch.setattr(evaluation, "make_crew", replaced)
     options = {"scenarios": list_scenarios("bus14", "validation")[:1], "name": "mine"}
     result = evaluate(path, "bus14-T0", workers=workers, **options)
     monkeypatch.undo()

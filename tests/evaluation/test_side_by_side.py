@@ -15,17 +15,19 @@ from rl2grid.agents.random_agent import RandomAgent
 from rl2grid.algorithms.policy_agent import load_agent
 from rl2grid.envs.options import TaskOptions
 from rl2grid.envs.tasks import find_task
+from rl2grid.evaluation import setting as setting_module
 from rl2grid.evaluation import side_by_side
 from rl2grid.evaluation.agents import make_agent
-from rl2grid.evaluation.crew import Crew, Job, Progress, Setting, make_crew
+from rl2grid.evaluation.crew import Job, Progress, make_crew
 from rl2grid.evaluation.protocol import env_keywords, evaluate
-from rl2grid.evaluation.side_by_side import SideBySideCrew, episodes_abreast
+from rl2grid.evaluation.setting import Setting
+from rl2grid.evaluation.side_by_side import episodes_abreast
 from rl2grid.records.episodes import Episode
 from rl2grid.scenarios.library import list_scenarios
 
 
-def played(crew: Crew[Episode], jobs: list[Job]) -> dict[Job, Episode]:
-    with crew:
+def played(setting: Setting, jobs: list[Job], workers: int = 0) -> dict[Job, Episode]:
+    with make_crew(setting, workers) as crew:
         return {job: replace(episode, wall_time_s=0.0) for job, episode in crew.play(jobs, lambda _: None)}
 
 
@@ -52,7 +54,7 @@ def test_rows_are_those_of_single_environments(agent: str, task: str, heuristic:
     months = list_scenarios(find_task(task).grid_id, "validation")[:4]
     jobs = [Job(month, seed, 0) for month in months for seed in (0, 1)]
     setting = setting_of(make_agent(agent, find_task(task)), task, heuristic, episode_length=steps)
-    alone, together = played(make_crew(setting, 0), jobs), played(SideBySideCrew(setting), jobs)
+    alone, together = played(replace(setting, abreast=1), jobs), played(setting, jobs)
     assert together == alone
     assert len({episode.episode_return for episode in alone.values()}) > 2
     assert any(not episode.completed for episode in alone.values()) or steps < 600
@@ -64,10 +66,10 @@ def test_episodes_that_end_before_a_decision_make_way_for_the_next(calm: slice) 
     months = list_scenarios("bus14", "validation")[:40]
     setting = setting_of(DoNothing(), "bus14-T0", "idle", episode_length=40)
     jobs = [Job(month, 0, 0) for month in months]
-    alone = played(make_crew(setting, 0), jobs)
+    alone = played(replace(setting, abreast=1), jobs)
     without = [job for job in jobs if not alone[job].decisions]
     jobs = without[calm] + [job for job in jobs if alone[job].decisions][:1]
-    assert played(SideBySideCrew(setting), jobs) == {job: alone[job] for job in jobs}
+    assert played(setting, jobs) == {job: alone[job] for job in jobs}
     assert all(alone[job].completed for job in without)
 
 
@@ -75,7 +77,7 @@ def test_it_tells_of_all_running_episodes(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(side_by_side, "REPORT_SECONDS", 0.0)
     told: list[Progress] = []
     jobs = [Job(month, 0, 0) for month in list_scenarios("bus14", "validation")[:3]]
-    with SideBySideCrew(setting_of(DoNothing(), "bus14-T0", None, episode_length=30)) as crew:
+    with make_crew(setting_of(DoNothing(), "bus14-T0", None, episode_length=30), 0) as crew:
         for _ in crew.play(jobs, told.append):
             pass
     assert {progress.job for progress in told} == set(jobs)
@@ -93,14 +95,14 @@ class Stubborn(DoNothing):
 class Wrapped:
     """Passes on all that it does not do itself."""
 
-    def __init__(self, agent: Agent) -> None:
-        self._agent = agent
+    def __init__(self, agent: Agent, action: int = 1) -> None:
+        self._agent, self._action = agent, action
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._agent, name)
 
     def act(self, observation: Any, info: Any) -> Any:
-        return 1
+        return self._action
 
 
 def test_only_who_decides_for_many_as_for_each_plays_side_by_side() -> None:
@@ -122,10 +124,19 @@ def test_only_who_decides_for_many_as_for_each_plays_side_by_side() -> None:
         assert episodes_abreast(DoNothing(), slow) == 1
 
 
-def test_an_evaluation_is_the_same_whoever_plays_it() -> None:
+def test_workers_play_side_by_side_as_well() -> None:
+    jobs = [Job(month, 0, 0) for month in list_scenarios("bus14", "validation")[:9]]
+    setting = setting_of(DoNothing(), "bus14-T0", None, episode_length=100)
+    assert played(setting, jobs, workers=2) == played(replace(setting, abreast=1), jobs)
+
+
+def test_an_evaluation_plays_side_by_side(monkeypatch: pytest.MonkeyPatch) -> None:
     months: dict[str, Any] = {"months": 3, "episode_length": 100}
-    here, there = (evaluate("do-nothing", "bus14-T0", workers=workers, **months) for workers in (0, 1))
-    assert [replace(episode, wall_time_s=0.0) for episode in here.episodes] == [
-        replace(episode, wall_time_s=0.0) for episode in there.episodes
+    monkeypatch.setattr(setting_module, "BoundAgent", None)
+    here = evaluate("do-nothing", "bus14-T0", **months)
+    monkeypatch.undo()
+    there = evaluate(Wrapped(DoNothing(), 0), "bus14-T0", **months)
+    assert [episode.episode_return for episode in here.episodes] == [
+        episode.episode_return for episode in there.episodes
     ]
     assert np.isfinite([episode.wall_time_s for episode in here.episodes]).all()

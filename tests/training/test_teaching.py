@@ -223,8 +223,9 @@ def test_a_pupil_acts_as_often_as_it_is_asked_to_and_the_teacher_is_told(tmp_pat
     setup = teaching.LabelSetup(
         rl2grid.tasks()["rl2grid/bus14-T0-v0"], teacher, DoNothing(), 0.5, 1.0, 8, 0.9, {"episode_length": 60}
     )
-    player = setup.player()
-    labels = player.play(teaching._job(setup.task, 0, 1, 0), lambda progress: None).labels
+    player = setup.player(1)
+    ((_, labelled),) = player.play([teaching._job(setup.task, 0, 1, 0)], lambda progress: None)
+    labels = labelled.labels
     player.close()
     assert 0.25 < labels.pupil.mean() < 0.75
     assert labels.topology is not None

@@ -1,6 +1,6 @@
 """Who plays many episodes, those of an evaluation for one: this process, or several worker processes.
 
-What is done with an episode is the part of a :class:`Player`, which every process makes of a copy of the same
+What is done with episodes is the part of a :class:`Player`, which every process makes of a copy of the same
 :class:`Setup`.
 
 A worker is a Python process that runs :func:`main`: it inherits no threads and does not import the
@@ -15,21 +15,14 @@ import queue
 import subprocess
 import sys
 import threading
-import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
 from types import TracebackType
 from typing import Any, BinaryIO, Generic, NamedTuple, Protocol, Self, TypeVar
 
-import gymnasium
-
-from rl2grid.agents.agent import Action, Agent, Info
-from rl2grid.envs.registration import own_systems, register_all, register_system
+from rl2grid.envs.registration import own_systems, register_system
 from rl2grid.errors import UsageError
-from rl2grid.evaluation.episode import OnTransition, play_episode
 from rl2grid.processes import kill, take_standard_streams
-from rl2grid.records.episodes import Episode
 
 REPORT_SECONDS = 0.5
 """Between two reports of how far running episodes are."""
@@ -69,10 +62,10 @@ OnProgress = Callable[[Progress], None]
 
 
 class Player(Protocol[Told]):
-    """Plays one episode after the other, and tells what is to be known of each."""
+    """Plays episodes, and tells what is to be known of each."""
 
-    def play(self, job: Job, on_progress: OnProgress) -> Told:
-        """Play an episode."""
+    def play(self, jobs: Sequence[Job], on_progress: OnProgress) -> Iterator[tuple[Job, Told]]:
+        """Play them, in no particular order."""
 
     def close(self) -> None:
         """Free what it plays with."""
@@ -81,29 +74,19 @@ class Player(Protocol[Told]):
 class Setup(Protocol[Told]):
     """What all episodes have in common; it can be pickled."""
 
-    def player(self) -> Player[Told]:
+    @property
+    def abreast(self) -> int:
+        """Episodes that a player plays at a time."""
+
+    def player(self, num_threads: int) -> Player[Told]:
         """Who plays them in this process.
+
+        Args:
+            num_threads: that it may use.
 
         Raises:
             UsageError: the environment or the agent cannot be made, or do not fit.
         """
-
-
-@dataclass(frozen=True)
-class Setting:
-    """What all episodes of an evaluation have in common."""
-
-    task: str
-    agent: Agent
-    """Not bound yet; workers play copies of it."""
-    env_keywords: Mapping[str, Any] = field(default_factory=dict)
-    """Keywords of ``gymnasium.make``."""
-    abreast: int = 1
-    """Episodes that this process plays at the same time, where it plays them."""
-
-    def player(self) -> BoundAgent:
-        """The agent, bound to an environment."""
-        return BoundAgent(self)
 
 
 class Crew(Protocol[Told]):
@@ -129,46 +112,8 @@ def make_crew(setup: Setup[Result], workers: int) -> Crew[Result]:
     return WorkerCrew(setup, workers) if workers else LocalCrew(setup)
 
 
-class BoundAgent:
-    """One environment and the agent bound to it."""
-
-    def __init__(self, setting: Setting) -> None:
-        register_all()
-        self._env = gymnasium.make(setting.task, disable_env_checker=True, **setting.env_keywords)
-        try:
-            self._agent = setting.agent
-            self._agent.bind(self._env)
-        except BaseException:
-            self._env.close()
-            raise
-
-    def play(self, job: Job, on_progress: OnProgress, on_transition: OnTransition | None = None) -> Episode:
-        """Play an episode; ``on_transition`` is told what came of every action."""
-        told = time.monotonic()
-
-        def tell(action: Action, info: Info) -> None:
-            nonlocal told
-            if time.monotonic() - told >= REPORT_SECONDS:
-                told = time.monotonic()
-                on_progress(Progress(job, int(info["step"]), int(info["episode_length"])))
-
-        return play_episode(
-            self._agent,
-            self._env,
-            scenario=job.scenario,
-            seed=job.seed,
-            start=job.start,
-            on_decision=tell,
-            on_transition=on_transition,
-        )
-
-    def close(self) -> None:
-        """Free the environment."""
-        self._env.close()
-
-
 class LocalCrew(Generic[Result]):
-    """Plays in this process, one episode after the other."""
+    """Plays in this process."""
 
     def __init__(self, setup: Setup[Result]) -> None:
         self._setup = setup
@@ -176,9 +121,8 @@ class LocalCrew(Generic[Result]):
 
     def play(self, jobs: Sequence[Job], on_progress: OnProgress) -> Iterator[tuple[Job, Result]]:
         """See :class:`Crew`."""
-        self._player = self._setup.player()
-        for job in jobs:
-            yield job, self._player.play(job, on_progress)
+        self._player = self._setup.player(os.cpu_count() or 1)
+        yield from self._player.play(jobs, on_progress)
 
     def __enter__(self) -> Self:
         return self
@@ -198,9 +142,8 @@ class WorkerCrew(Generic[Result]):
 
     def play(self, jobs: Sequence[Job], on_progress: OnProgress) -> Iterator[tuple[Job, Result]]:
         """See :class:`Crew`."""
-        waiting = list(reversed(jobs))
-        open_jobs = len(waiting)
-        for _ in range(min(self._workers, open_jobs)):
+        waiting, open_jobs = self._shares(jobs), len(jobs)
+        for _ in range(min(self._workers, len(waiting))):
             worker = _Worker(self._setup, self._answers)
             self._running.append(worker)
             worker.send(waiting.pop())
@@ -209,18 +152,17 @@ class WorkerCrew(Generic[Result]):
             if outcome == "refused":
                 raise UsageError(value)
             if outcome == "failed":
-                raise RuntimeError(f"A worker failed while it played {worker.job}:\n{value}")
+                raise RuntimeError(f"A worker failed while it played {worker.playing}:\n{value}")
             if outcome == "died":
-                raise RuntimeError(f"A worker died with exit status {value} while it played {worker.job}.")
+                raise RuntimeError(f"A worker died with exit status {value} while it played {worker.playing}.")
             if outcome == "progress":
                 on_progress(value)
-                continue
-            open_jobs -= 1
-            job = worker.job
-            assert job is not None
-            if waiting:
-                worker.send(waiting.pop())
-            yield job, value
+            elif outcome == "done":
+                if waiting:
+                    worker.send(waiting.pop())
+            else:
+                open_jobs -= 1
+                yield value
 
     def __enter__(self) -> Self:
         return self
@@ -228,6 +170,13 @@ class WorkerCrew(Generic[Result]):
     def __exit__(self, *_: object) -> None:
         for worker in self._running:
             worker.kill()
+
+    def _shares(self, jobs: Sequence[Job]) -> list[Sequence[Job]]:
+        """What is given to whoever is free, the last one first: single episodes, or as many as are played abreast."""
+        if self._setup.abreast == 1:
+            return [[job] for job in reversed(jobs)]
+        n = min(self._workers, len(jobs))
+        return [jobs[k::n] for k in range(n)]
 
     def _next_answer(self) -> tuple[_Worker, str, Any]:
         while True:
@@ -242,8 +191,7 @@ class _Worker:
     """A worker process, and the thread that collects its answers."""
 
     def __init__(self, setup: Setup[Any], answers: queue.SimpleQueue[tuple[_Worker, str, Any]]) -> None:
-        self.job: Job | None = None
-        """What it plays."""
+        self._jobs: Sequence[Job] = ()
         self._answers = answers
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-c", _WORKER],
@@ -257,10 +205,15 @@ class _Worker:
         self._send(own_systems())
         self._send(setup)
 
-    def send(self, job: Job) -> None:
-        """Ask for an episode."""
-        self.job = job
-        self._send(job)
+    @property
+    def playing(self) -> str:
+        """What it plays, in words."""
+        return str(self._jobs[0]) if len(self._jobs) == 1 else f"{len(self._jobs)} episodes"
+
+    def send(self, jobs: Sequence[Job]) -> None:
+        """Ask for episodes."""
+        self._jobs = jobs
+        self._send(jobs)
 
     def kill(self) -> None:
         """End the process, whatever it is doing."""
@@ -297,13 +250,15 @@ def serve(requests: BinaryIO, answers: BinaryIO) -> None:
         sys.path += [folder for folder in pickle.load(requests) if folder not in sys.path]
         for system in pickle.load(requests):
             register_system(system)
-        player = pickle.load(requests).player()
+        player = pickle.load(requests).player(1)
         while True:
             try:
-                job = pickle.load(requests)
+                jobs = pickle.load(requests)
             except EOFError:
                 break
-            answer("played", player.play(job, lambda progress: answer("progress", progress)))
+            for played in player.play(jobs, lambda progress: answer("progress", progress)):
+                answer("played", played)
+            answer("done", None)
         player.close()
     except UsageError as error:
         answer("refused", str(error))

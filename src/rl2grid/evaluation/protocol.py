@@ -24,9 +24,10 @@ from rl2grid.envs.options import OBSERVED_WITH, TaskOptions, options_of
 from rl2grid.envs.tasks import Task, constraint_of, find_task
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import make_agent
-from rl2grid.evaluation.crew import Job, Setting
+from rl2grid.evaluation.crew import Job, make_crew
 from rl2grid.evaluation.progress import show_progress, watch_making
-from rl2grid.evaluation.side_by_side import episodes_abreast, find_crew
+from rl2grid.evaluation.setting import Setting
+from rl2grid.evaluation.side_by_side import episodes_abreast
 from rl2grid.mdp.actions import action_set_hash
 from rl2grid.mdp.rewards import resolve_reward, reward_name
 from rl2grid.records.episodes import Episode
@@ -82,10 +83,10 @@ def evaluate(
             (:func:`rl2grid.evaluation.episode.environment_seed`).
         start: row of each scenario at which its episodes begin.
         heuristic: None, one of :data:`rl2grid.engines.HEURISTICS`, or :data:`AS_TRAINED`.
-        workers: processes that play at the same time, an episode each; 0: this process plays, many episodes side by
-            side if the agent decides for many (:class:`~rl2grid.agents.agent.SideBySideAgent`); None: this one for
-            such agents, for less than 100 episodes, and for agents that are not given by name or path, on the native
-            engine, else one per processor core. No influence on results.
+        workers: processes that play at the same time, each many episodes side by side if the agent decides for many
+            (:class:`~rl2grid.agents.agent.SideBySideAgent`); 0: this process plays; None: this one for less than 100
+            episodes of the native engine, and for agents that are not given by name or path, else one per processor
+            core. No influence on results.
         output: folder to store the evaluation in, and to continue it from; None: nothing is stored.
         progress: whether to show a progress bar with rate and remaining time.
         name: what tables call the agent; None: its own name.
@@ -104,16 +105,15 @@ def evaluate(
     jobs = _jobs(chosen_scenarios, seeds, start)
     _check_lengths(task, chosen_scenarios, start, keywords.get("episode_length"))
     checked = TaskOptions(**keywords)
-    abreast = episodes_abreast(chosen, checked)
-    processes = _number_of_workers(workers, checked.engine, agent, len(jobs), abreast)
+    processes = _number_of_workers(workers, checked.engine, agent, len(jobs))
     if output is not None:
         check_folder(output)  # before months are made, which takes minutes
     # The agent whose identity is stored, not its path: a run that still trains replaces the file.
-    setting = Setting(task.id, chosen, keywords, abreast)
+    setting = Setting(task.id, chosen, keywords, episodes_abreast(chosen, checked))
     made, total = make_scenarios(task.grid_id, chosen_scenarios)
     there = next(made)
     if there < total:  # what the agent refuses, likewise; workers are sent the agent, which is not to be bound then
-        (copy.deepcopy(setting) if processes else setting).player().close()
+        (copy.deepcopy(setting) if processes else setting).player(1).close()
     watch_making(task.grid_id, itertools.chain((there,), made), total, progress)
     return run_evaluation(
         setting,
@@ -138,7 +138,7 @@ def check_playable(agent: Agent, task: Task, options: Mapping[str, Any]) -> None
         UsageError: the agent cannot play the task, or not with these options.
     """
     keywords = env_keywords(agent, {"heuristic": AS_TRAINED, **options})
-    Setting(task.id, agent, keywords).player().close()
+    Setting(task.id, agent, keywords).player(1).close()
 
 
 def first_months(task: Task, split: str, months: int | None) -> tuple[str, ...]:
@@ -194,7 +194,7 @@ def run_evaluation(
         display.skip(done)
         missing = [job for job in jobs if job not in done]
         if missing:
-            with find_crew(setting, workers) as crew:
+            with make_crew(setting, workers) as crew:
                 for job, played in crew.play(missing, display.advance):
                     episode = replace(played, **of_all)
                     store.add(episode)
@@ -229,12 +229,11 @@ def _checked(agent: Agent) -> Agent:
     return agent
 
 
-def _number_of_workers(workers: int | None, engine: str, agent: str | Path | Agent, n_jobs: int, abreast: int) -> int:
+def _number_of_workers(workers: int | None, engine: str, agent: str | Path | Agent, n_jobs: int) -> int:
     if workers is None:
-        # Few native episodes are over before another process has started, those that are played side by side share the
-        # cores already, and an agent of the caller's own script may not be known there.
-        is_quick = n_jobs < _MANY_JOBS or abreast > 1
-        is_here = engine == "native" and (is_quick or not isinstance(agent, str | Path))
+        # Few native episodes are over before another process has started, and an agent of the caller's own script may
+        # not be known there.
+        is_here = engine == "native" and (n_jobs < _MANY_JOBS or not isinstance(agent, str | Path))
         return 0 if is_here else os.cpu_count() or 1
     if not isinstance(workers, int) or workers < 0:
         raise UsageError(f"workers={workers!r} is not allowed: give a number of processes, 0 or more.")

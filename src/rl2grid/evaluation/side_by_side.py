@@ -5,11 +5,9 @@ What is played is what :func:`rl2grid.evaluation.episode.play_episode` plays of 
 
 from __future__ import annotations
 
-import os
 import time
-from collections.abc import Iterator, Sequence
-from types import TracebackType
-from typing import Any, Self
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -21,7 +19,7 @@ from rl2grid.envs.options import TaskOptions
 from rl2grid.envs.registration import register_all
 from rl2grid.envs.tasks import find_task
 from rl2grid.evaluation.collapse import collapse, overloaded_lines
-from rl2grid.evaluation.crew import REPORT_SECONDS, Crew, Job, OnProgress, Progress, Setting, make_crew
+from rl2grid.evaluation.crew import REPORT_SECONDS, Job, OnProgress, Progress
 from rl2grid.evaluation.episode import TOTALS, Tally, environment_seed, episode_of
 from rl2grid.records.episodes import Episode
 
@@ -29,13 +27,8 @@ _ABREAST = 32
 """Episodes that are under way at the same time where many can be."""
 
 
-def find_crew(setting: Setting, workers: int) -> Crew[Episode]:
-    """Who plays the episodes: worker processes, or this one, one after the other or side by side."""
-    return make_crew(setting, workers) if workers or setting.abreast == 1 else SideBySideCrew(setting)
-
-
 def episodes_abreast(agent: Agent, options: TaskOptions) -> int:
-    """How many episodes one process plays at a time.
+    """How many episodes a process plays at a time.
 
     More than one if the agent decides for many environments at once and compiled code steps them.
     """
@@ -52,33 +45,44 @@ def _decides_side_by_side(agent: Agent) -> bool:
     return first == ways[0] and isinstance(agent, SideBySideAgent) and agent.decides_side_by_side
 
 
-class SideBySideCrew:
-    """Plays in this process, many episodes at a time."""
+class SideBySidePlayer:
+    """Plays many episodes at a time.
 
-    def __init__(self, setting: Setting) -> None:
-        self._setting = setting
+    Args:
+        task: id of the task.
+        agent: not bound yet; a :class:`~rl2grid.agents.agent.SideBySideAgent`.
+        env_keywords: keywords of ``gymnasium.make``.
+        abreast: so many, at most.
+        num_threads: share them.
+
+    Raises:
+        UsageError: the environment cannot be made, or the agent cannot play it.
+    """
+
+    def __init__(
+        self, task: str, agent: Agent, env_keywords: Mapping[str, Any], abreast: int, num_threads: int
+    ) -> None:
+        self._task, self._agent, self._abreast, self._num_threads = find_task(task), agent, abreast, num_threads
+        self._options = TaskOptions(**env_keywords)
         self._rows: NativeRows | None = None
-
-    def play(self, jobs: Sequence[Job], on_progress: OnProgress) -> Iterator[tuple[Job, Episode]]:
-        """See :class:`~rl2grid.evaluation.crew.Crew`."""
-        task, keywords = self._setting.task, self._setting.env_keywords
         register_all()
-        env = gymnasium.make(task, disable_env_checker=True, **keywords)
+        env = gymnasium.make(task, disable_env_checker=True, **env_keywords)
         try:
-            self._setting.agent.bind(env)
+            agent.bind(env)
         finally:
             env.close()
-        n = min(len(jobs), self._setting.abreast)
-        self._rows = NativeRows(find_task(task), TaskOptions(**keywords), n, os.cpu_count())
-        table = _Table(self._setting.agent, self._rows, repeated(no_intervention(env.action_space), n), n)
+        self._nothing = no_intervention(env.action_space)
+
+    def play(self, jobs: Sequence[Job], on_progress: OnProgress) -> Iterator[tuple[Job, Episode]]:
+        """See :class:`~rl2grid.evaluation.crew.Player`."""
+        self.close()
+        n = min(len(jobs), self._abreast)
+        self._rows = NativeRows(self._task, self._options, n, self._num_threads)
+        table = _Table(self._agent, self._rows, repeated(self._nothing, n), n)
         yield from table.play(jobs, on_progress)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
+        """Free the environments."""
         if self._rows is not None:
             self._rows.close()
 

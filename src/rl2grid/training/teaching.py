@@ -9,21 +9,22 @@ from __future__ import annotations
 
 import copy
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from rl2grid.agents.agent import Agent
 from rl2grid.envs.options import DEFAULTS, OBSERVED_WITH, TaskOptions, changed_options, options_of
 from rl2grid.envs.tasks import Task, find_task
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.agents import make_agent
-from rl2grid.evaluation.crew import BoundAgent, Job, OnProgress, Setting, make_crew
+from rl2grid.evaluation.crew import Job, OnProgress, make_crew
 from rl2grid.evaluation.flags import environment_flags, flags
 from rl2grid.evaluation.places import default_folder
 from rl2grid.evaluation.progress import show_progress, watch_making
 from rl2grid.evaluation.protocol import AS_TRAINED, env_keywords
+from rl2grid.evaluation.setting import BoundAgent, Setting
 from rl2grid.mdp.rewards import resolve_reward
 from rl2grid.records.episodes import Episode
 from rl2grid.records.files import check_folder, printable
@@ -68,7 +69,9 @@ class LabelSetup:
     gamma: float
     env_keywords: Mapping[str, Any]
 
-    def player(self) -> LabelPlayer:
+    abreast: ClassVar[int] = 1
+
+    def player(self, num_threads: int) -> LabelPlayer:
         """Who plays them in this process."""
         return LabelPlayer(self)
 
@@ -84,10 +87,11 @@ class LabelPlayer:
         keywords = {**changed_options(setup.env_keywords), "gamma": setup.gamma}
         self._bound = BoundAgent(Setting(setup.task.id, self._labeller, keywords))
 
-    def play(self, job: Job, on_progress: OnProgress) -> Labelled:
-        """Play a month and label it."""
-        episode = self._bound.play(job, on_progress, self._labeller.note)
-        return Labelled(episode, self._labeller.acted, self._labeller.labels(self._gamma))
+    def play(self, jobs: Sequence[Job], on_progress: OnProgress) -> Iterator[tuple[Job, Labelled]]:
+        """Play months and label them."""
+        for job in jobs:
+            episode = self._bound.play_one(job, on_progress, self._labeller.note)
+            yield job, Labelled(episode, self._labeller.acted, self._labeller.labels(self._gamma))
 
     def close(self) -> None:
         """Free the environment."""
@@ -188,7 +192,7 @@ def teach(
     )
     check_folder(folder)
     # What cannot be played, or whose months have no room, is refused before anything is written.
-    copy.deepcopy(setup).player().close()
+    copy.deepcopy(setup).player(1).close()
     check_training_room(task.grid_id, months)
     watch_making(task.grid_id, *make_scenarios(task.grid_id, [_job(task, seed, 0, 0).scenario]), False)
     call = command or _call(
