@@ -172,7 +172,9 @@ class WorkerCrew(Generic[Result]):
             worker.kill()
 
     def _shares(self, jobs: Sequence[Job]) -> list[Sequence[Job]]:
-        """What is given to whoever is free, the last one first: single episodes, or as many as are played abreast."""
+        """What is given to whoever is free, the last one first: an episode, or where many are played abreast all of its
+        part.
+        """
         if self._setup.abreast == 1:
             return [[job] for job in reversed(jobs)]
         n = min(self._workers, len(jobs))
