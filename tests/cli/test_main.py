@@ -144,7 +144,7 @@ def test_outputs_below_a_file_are_refused_before_anything_is_played(capsys, tmp_
     (tmp_path / "few.toml").write_text(tuning)
     command_line = [str(tmp_path / "few.toml") if word == "TUNING" else word for word in command_line]
     monkeypatch.setattr(ppo.PPO, "iterate", None)
-    monkeypatch.setattr("rl2grid.evaluation.crew.play_episode", None)
+    monkeypatch.setattr("rl2grid.evaluation.protocol.make_crew", None)
     sentence = refused(capsys, *command_line, str(tmp_path / "file" / "a" / "b"))
     assert "cannot be made" in sentence
 
