@@ -45,6 +45,7 @@ def setting_of(agent: Agent, task: str, heuristic: str | None, **options: Any) -
         ("pretrained/bus14-R", "bus14-R", None, 80),
         ("pretrained/bus14-R", "bus14-R", "recovery", 1500),
         ("pretrained/bus36-MO-v0-T1", "bus36-MO-v0-T1", "careful", 600),
+        ("do-nothing", "bus14-T0-TLO", "idle", 600),
         ("do-nothing", "bus14-H0", None, 600),
         ("pretrained/bus14-H1", "bus14-H1", "recovery", 500),
         ("pretrained/bus36-MO-v0-H1", "bus36-MO-v0-H1", None, 60),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -12,6 +12,7 @@ import gymnasium
 
 from rl2grid.agents.agent import Action, Agent, Info, RandomizedAgent, no_intervention
 from rl2grid.envs.operation import Operation
+from rl2grid.envs.registration import register_all
 from rl2grid.errors import UsageError
 from rl2grid.evaluation.collapse import COMPLETED, Collapse, collapse, overloaded_lines
 from rl2grid.mdp.constraint_table import CONSTRAINTS
@@ -43,6 +44,27 @@ class Tally:
     ambiguous: int = 0
     seconds: float = 0.0
     """It took."""
+
+
+def bound_environment(agent: Agent, task: str, keywords: Mapping[str, Any]) -> gymnasium.Env[Any, Any]:
+    """An environment to which the agent is bound.
+
+    Args:
+        agent: not bound yet.
+        task: id of the task.
+        keywords: of ``gymnasium.make``.
+
+    Raises:
+        UsageError: the environment cannot be made, or the agent cannot play it.
+    """
+    register_all()
+    env = gymnasium.make(task, disable_env_checker=True, **keywords)
+    try:
+        agent.bind(env)
+    except BaseException:
+        env.close()
+        raise
+    return env
 
 
 def play_episode(

@@ -99,12 +99,11 @@ def evaluate(
     task = find_task(task)
     chosen = make_agent(agent, task) if isinstance(agent, str | Path) else _checked(agent)
     keywords = env_keywords(chosen, {**options, "split": split, "heuristic": heuristic})
-    options_of(task, keywords)
+    checked = options_of(task, keywords)
     resolve_reward(keywords.get("reward", "default"))
     chosen_scenarios = _checked_scenarios(task, split, months, scenarios)
     jobs = _jobs(chosen_scenarios, seeds, start)
     _check_lengths(task, chosen_scenarios, start, keywords.get("episode_length"))
-    checked = TaskOptions(**keywords)
     processes = _number_of_workers(workers, checked.engine, agent, len(jobs))
     if output is not None:
         check_folder(output)  # before months are made, which takes minutes

@@ -7,12 +7,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import gymnasium
-
 from rl2grid.agents.agent import Action, Agent, Info
-from rl2grid.envs.registration import register_all
 from rl2grid.evaluation.crew import REPORT_SECONDS, Job, OnProgress, Player, Progress
-from rl2grid.evaluation.episode import OnTransition, play_episode
+from rl2grid.evaluation.episode import OnTransition, bound_environment, play_episode
 from rl2grid.evaluation.side_by_side import SideBySidePlayer
 from rl2grid.records.episodes import Episode
 
@@ -40,14 +37,8 @@ class BoundAgent:
     """One environment and the agent bound to it."""
 
     def __init__(self, setting: Setting) -> None:
-        register_all()
-        self._env = gymnasium.make(setting.task, disable_env_checker=True, **setting.env_keywords)
-        try:
-            self._agent = setting.agent
-            self._agent.bind(self._env)
-        except BaseException:
-            self._env.close()
-            raise
+        self._agent = setting.agent
+        self._env = bound_environment(setting.agent, setting.task, setting.env_keywords)
 
     def play(self, jobs: Sequence[Job], on_progress: OnProgress) -> Iterator[tuple[Job, Episode]]:
         """See :class:`~rl2grid.evaluation.crew.Player`: one after the other."""

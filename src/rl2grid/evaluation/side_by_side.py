@@ -9,18 +9,15 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-import gymnasium
 import numpy as np
 
 from rl2grid.agents.agent import Actions, Agent, SideBySideAgent, no_intervention, repeated
 from rl2grid.arrays import I64
 from rl2grid.envs.native_rows import NativeRows
 from rl2grid.envs.options import TaskOptions
-from rl2grid.envs.registration import register_all
-from rl2grid.envs.tasks import find_task
 from rl2grid.evaluation.collapse import collapse, overloaded_lines
 from rl2grid.evaluation.crew import REPORT_SECONDS, Job, OnProgress, Progress
-from rl2grid.evaluation.episode import TOTALS, Tally, environment_seed, episode_of
+from rl2grid.evaluation.episode import TOTALS, Tally, bound_environment, environment_seed, episode_of
 from rl2grid.records.episodes import Episode
 
 _ABREAST = 32
@@ -62,16 +59,12 @@ class SideBySidePlayer:
     def __init__(
         self, task: str, agent: Agent, env_keywords: Mapping[str, Any], abreast: int, num_threads: int
     ) -> None:
-        self._task, self._agent, self._abreast, self._num_threads = find_task(task), agent, abreast, num_threads
-        self._options = TaskOptions(**env_keywords)
+        self._agent, self._abreast, self._num_threads = agent, abreast, num_threads
         self._rows: NativeRows | None = None
-        register_all()
-        env = gymnasium.make(task, disable_env_checker=True, **env_keywords)
-        try:
-            agent.bind(env)
-        finally:
-            env.close()
-        self._nothing = no_intervention(env.action_space)
+        env = bound_environment(agent, task, env_keywords)
+        base: Any = env.unwrapped
+        self._task, self._options, self._nothing = base.task, base.options, no_intervention(env.action_space)
+        env.close()
 
     def play(self, jobs: Sequence[Job], on_progress: OnProgress) -> Iterator[tuple[Job, Episode]]:
         """See :class:`~rl2grid.evaluation.crew.Player`."""
@@ -95,7 +88,7 @@ class _Table:
         self._jobs: dict[int, Job] = {}
         self._steps, self._loadings = np.zeros(n, np.int64), np.zeros_like(self._state.rho)  # before the last decision
         self._totals = np.zeros((n, len(TOTALS)))
-        self._counts = np.zeros((n, 3), np.int64)  # decisions, those that were illegal, and ambiguous
+        self._refused = np.zeros((n, 2), np.int64)  # decisions that were illegal, and ambiguous
         self._seconds = np.zeros(n)
 
     def play(self, jobs: Sequence[Job], on_progress: OnProgress) -> Iterator[tuple[Job, Episode]]:
@@ -130,7 +123,7 @@ class _Table:
         self._jobs[i] = job
         state = self._state
         self._totals[i] = (state.reset_reward[i], *state.reset_components[i], *state.reset_costs[i])
-        self._counts[i] = 0
+        self._refused[i] = 0
         self._steps[i] = state.step[i]
         self._seconds[i] = time.perf_counter() - began
 
@@ -144,17 +137,16 @@ class _Table:
         self._rows.advance(rows, self._actions)
         self._totals[rows, 0] += state.transition_reward[rows]
         self._totals[rows, 1:] += np.hstack((state.transition_components[rows], state.transition_costs[rows]))
-        self._counts[rows, 0] += 1
-        self._counts[rows, 1] += state.illegal[rows]
-        self._counts[rows, 2] += state.ambiguous[rows]
+        self._refused[rows, 0] += state.illegal[rows]
+        self._refused[rows, 1] += state.ambiguous[rows]
         self._seconds[rows] += (time.perf_counter() - began) / len(rows)
 
     def _finish(self, i: int) -> tuple[Job, Episode]:
         """The episode of row ``i``, which is over."""
         job, state = self._jobs.pop(i), self._state
         totals = dict(zip(TOTALS, self._totals[i].tolist(), strict=True))
-        decisions, illegal, ambiguous = self._counts[i].tolist()
-        tally = Tally(totals, decisions, illegal, ambiguous, float(self._seconds[i]))
+        illegal, ambiguous = self._refused[i].tolist()
+        tally = Tally(totals, int(state.decisions[i]), illegal, ambiguous, float(self._seconds[i]))
         # A later step of a transition comes from a state at which the heuristic was at ease.
         overloads = overloaded_lines(self._loadings[i]) if state.step[i] == self._steps[i] + 1 else ""
         ending = collapse(state, i, overloads) if state.terminated[i] else None

@@ -249,9 +249,7 @@ def snapshot_of(engine: NativeEngine, i: int) -> Snapshot:
     Raises:
         UsageError: the environment is not in an episode.
     """
-    if engine.state.terminated[i] or not engine.state.line_status[i].any():
-        raise UsageError("Nothing can be asked after a game over or before a reset: reset the environment first.")
-    return _copied(_point_of(engine.environments, i))
+    return _copied(_present(engine, i))
 
 
 def forecast_of(engine: NativeEngine, i: int, horizon: int = 1) -> Snapshot | None:
@@ -264,8 +262,8 @@ def forecast_of(engine: NativeEngine, i: int, horizon: int = 1) -> Snapshot | No
     Raises:
         UsageError: after a game over, or without such a forecast.
     """
-    foreseen = engine.foresee(i, horizon)
-    return None if foreseen is None else _copied(_point_of(foreseen, 0))
+    point = _foreseen(engine, i, horizon)
+    return None if point is None else _copied(point)
 
 
 def what_if(
@@ -280,12 +278,12 @@ def what_if(
 
     Where the generators cannot follow the forecast, every verdict is DISPATCH.
     """
-    snapshot = snapshot_of(engine, i) if moment is Moment.PRESENT else forecast_of(engine, i)
-    if snapshot is None:
+    point = _present(engine, i) if moment is Moment.PRESENT else _foreseen(engine, i)
+    if point is None:
         n = len(catalogue) if ids is None else len(ids)
         nothing = np.zeros(n, np.int32)
         return ActionOutcomes(np.full(n, np.inf, np.float32), np.full(n, _DISPATCH, np.int8), nothing, nothing == 0)
-    return _solver_of(engine, num_threads).actions(snapshot, catalogue, ids)
+    return _solver_of(engine, num_threads).actions(point, catalogue, ids)
 
 
 def first_safe(engine: NativeEngine, i: int, catalogue: ActionCatalogue, ids: Ids, limit: float) -> FirstSafe:
@@ -293,20 +291,20 @@ def first_safe(engine: NativeEngine, i: int, catalogue: ActionCatalogue, ids: Id
 
     Where the generators cannot follow the forecast, it is the first.
     """
-    foreseen = engine.foresee(i, 1)
-    if foreseen is None:
+    point = _foreseen(engine, i)
+    if point is None:
         return FirstSafe(0, np.inf, False)
-    return _solver_of(engine, 1).first_safe(_point_of(foreseen, 0), catalogue, ids, limit)
+    return _solver_of(engine, 1).first_safe(point, catalogue, ids, limit)
 
 
 def outages(engine: NativeEngine, i: int) -> OutageOutcomes:
     """The flow after the loss of each line in environment ``i``, as last observed; see :meth:`WhatIf.outages`."""
-    return _solver_of(engine, 1).outages(snapshot_of(engine, i))
+    return _solver_of(engine, 1).outages(_present(engine, i))
 
 
 def n_minus_1_score(engine: NativeEngine, i: int) -> float:
     """Share of the lines in service whose loss would leave neither an overload nor a collapse."""
-    security = _solver_of(engine, 1).security(snapshot_of(engine, i))
+    security = _solver_of(engine, 1).security(_present(engine, i))
     return 1.0 - security.n_unsafe / max(security.n_outages, 1)
 
 
@@ -319,6 +317,19 @@ def _solver_of(engine: NativeEngine, num_threads: int) -> WhatIf:
 
 
 _SOLVERS: WeakKeyDictionary[NativeEngine, dict[int, WhatIf]] = WeakKeyDictionary()
+
+
+def _present(engine: NativeEngine, i: int) -> Snapshot:
+    """What :func:`snapshot_of` copies."""
+    if engine.state.terminated[i] or not engine.state.line_status[i].any():
+        raise UsageError("Nothing can be asked after a game over or before a reset: reset the environment first.")
+    return _point_of(engine.environments, i)
+
+
+def _foreseen(engine: NativeEngine, i: int, horizon: int = 1) -> Snapshot | None:
+    """What :func:`forecast_of` copies: it is there until the next simulation."""
+    foreseen = engine.foresee(i, horizon)
+    return None if foreseen is None else _point_of(foreseen, 0)
 
 
 def _point_of(environments: Environments, i: int) -> Snapshot:
