@@ -355,6 +355,32 @@ def test_policies_whose_network_says_so_decide_the_same_beside_others(name: str,
         assert torch.equal(together, torch.cat(alone)), type(policy).__name__
 
 
+@pytest.mark.parametrize("frozen", [True, False])
+@pytest.mark.parametrize(("name", "shortlist"), [("mlp", None), ("mlp", 20), ("gnn", None), ("gnn", 20)])
+def test_scores_are_what_tensors_say(name: str, shortlist: int | None, frozen: bool):
+    spec = task_spec(find_task("bus14-T0"))
+
+    def factory() -> NetworkFactory:
+        return NetworkFactory(spec, name, torch.Generator().manual_seed(1), shortlist)
+
+    draws = torch.Generator().manual_seed(2)
+    observations = torch.randn(5, spec.observation_size, generator=draws)
+    masks = torch.rand(5, spec.action_size, generator=draws) < 0.7
+    policies: list[Any] = [ActorCritic(factory(), actor_layers=(32, 24), critic_layers=(8,))]
+    policies += [CategoricalActor(factory(), (32, 24)), QNetwork(factory(), (32, 24))]
+    policies += [QNetwork(factory(), (32,), count=2)]
+    policies += [QNetwork(factory(), (32,), head="dueling")] if shortlist is None else []
+    for policy in policies:
+        if frozen:
+            freeze(policy)
+        with torch.no_grad():
+            preferences = policy.preferences(observations, masks)
+        scores = policy.scores(observations.numpy(), masks.numpy())
+        assert scores.dtype == np.float32
+        said = torch.from_numpy(scores)
+        assert torch.equal(said.exp() if policy.preference == "probability" else said, preferences), type(policy)
+
+
 def test_networks_of_ones_own_are_not_taken_for_such():
     assert not Network("own", Lines).row_by_row
     assert not any(find_network(name).row_by_row for name in ("gnn", "action-embedding"))

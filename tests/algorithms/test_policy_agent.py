@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -81,6 +82,30 @@ def test_a_loaded_policy_plays_the_deterministic_actions_of_the_trained_one(cont
             else:
                 logits = ppo.network.actor(observations)[0].masked_fill(~torch.as_tensor(env.action_masks()), -np.inf)
                 assert agent.act(observation, {}) == int(logits.argmax())
+
+
+@pytest.mark.parametrize("name", ["bus14-T0", "bus36-MO-v1-T0"])
+@pytest.mark.parametrize("masked", [True, False])
+def test_networks_without_scores_of_their_own_decide_the_same(name: str, masked: bool):
+    scored, asked = (load_agent(Path(f"pretrained/{name}")) for _ in range(2))
+    assert scored._has_scores
+    asked._has_scores = False
+    env = gymnasium.make(scored.task, split="validation", **scored.env_keywords)
+    for agent in (scored, asked):
+        agent.bind(env)
+        agent._mask_actions &= masked
+    env.action_space.seed(1)
+    observation, info = env.reset(seed=3)
+    for _ in range(30):
+        assert scored.act(observation, info) == asked.act(observation, info)
+        assert scored.explain() == asked.explain()
+        (ours, order), (theirs, preferences) = (agent.best(observation, 7) for agent in (scored, asked))
+        assert ours == theirs
+        assert scored.preferences_of(order) == asked.preferences_of(preferences)
+        observation, _, terminated, truncated, info = env.step(env.action_space.sample())
+        if terminated or truncated:
+            observation, info = env.reset()
+    env.close()
 
 
 @BOTH

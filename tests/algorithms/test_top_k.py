@@ -74,7 +74,8 @@ def test_of_the_best_actions_the_first_that_is_safe_is_played_else_the_least_loa
         if info["over"]:
             continue
         agent.reset(0)
-        candidates, preferences = policy.best(observation, 12)
+        candidates, order = policy.best(observation, 12)
+        preferences = policy.preferences_of(order)
         assert len(set(candidates)) == 12
         assert preferences == sorted(preferences, reverse=True)
         assert base.action_masks()[candidates].all()

@@ -31,12 +31,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from gymnasium.vector import VectorEnv
 from torch import Tensor, nn
 
 from rl2grid.algorithms.hyperparameters import changed_preset
-from rl2grid.algorithms.networks import NetworkFactory, Output
+from rl2grid.algorithms.networks import NetworkFactory, Output, outputs_of
 from rl2grid.algorithms.off_policy import (
     Batch,
     OffPolicyArgs,
@@ -46,6 +47,7 @@ from rl2grid.algorithms.off_policy import (
 )
 from rl2grid.algorithms.registry import Algorithm
 from rl2grid.algorithms.starting import StartingPolicy
+from rl2grid.arrays import F32, Flags
 from rl2grid.dense.choices import NEVER
 from rl2grid.errors import UsageError, one_of
 
@@ -214,6 +216,14 @@ class QNetwork(nn.Module):
         """Values of the actions, [batch, actions]; of illegal ones large and negative."""
         values: Tensor = self(observations)
         return values if masks is None else values.masked_fill(~masks, NEVER)
+
+    def scores(self, rows: F32, legal: Flags) -> F32:
+        """The same of rows [batch, size] and legal actions [batch, actions], of a single network without tensors."""
+        if self.dueling or len(self.networks) > 1:
+            with torch.no_grad():
+                values: F32 = self.preferences(torch.from_numpy(rows), torch.from_numpy(legal)).numpy()
+            return values
+        return np.where(legal, outputs_of(self.networks[0], rows), np.float32(NEVER))
 
 
 def best_actions(values: Tensor, masks: Tensor | None) -> Tensor:

@@ -44,13 +44,19 @@ from torch import Tensor, nn
 
 from rl2grid.algorithms.descent import Adam, descend
 from rl2grid.algorithms.diagnostics import mean
-from rl2grid.algorithms.networks import PER_ACTION, VALUE, NetworkFactory, orthogonal
+from rl2grid.algorithms.networks import PER_ACTION, VALUE, NetworkFactory, orthogonal, outputs_of
 from rl2grid.algorithms.pair import Pair
 from rl2grid.algorithms.playing import Tally
-from rl2grid.algorithms.sampling import drawn, legal_log_softmax, log_probabilities_and_entropies
+from rl2grid.algorithms.sampling import (
+    drawn,
+    legal_log_softmax,
+    log_probabilities_and_entropies,
+    log_probabilities_of,
+)
 from rl2grid.algorithms.starting import StartingPolicy
 from rl2grid.algorithms.teacher import TeacherArgs, divergences
 from rl2grid.algorithms.trainer import Played, Trainer
+from rl2grid.arrays import F32, Flags
 
 # --- Hyperparameters ------------------------------------------------------------------------------------------------
 
@@ -176,6 +182,10 @@ class ActorCritic(nn.Module):
     def preferences(self, observations: Tensor, masks: Tensor | None) -> Tensor:
         """Probabilities of discrete actions, [batch, actions]."""
         return legal_log_softmax(self.actor(observations), masks).exp()
+
+    def scores(self, rows: F32, legal: Flags) -> F32:
+        """Log-probabilities of discrete actions as of :meth:`distribution`, without tensors; all [batch, ...]."""
+        return log_probabilities_of(outputs_of(self.actor, rows), legal)
 
     def log_probability_and_entropy(
         self, observations: Tensor, actions: Tensor, masks: Tensor | None

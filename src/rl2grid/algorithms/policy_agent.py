@@ -20,6 +20,7 @@ from rl2grid.algorithms.networks import find_network
 from rl2grid.algorithms.networks.mlp import freeze
 from rl2grid.algorithms.pretrained import PREFIX, is_pretrained, pretrained
 from rl2grid.algorithms.registry import find_algorithm
+from rl2grid.arrays import F32, Flags
 from rl2grid.envs.joint import JointAsBox, JointAsDiscrete
 from rl2grid.envs.normalization import ObservationNormalizer
 from rl2grid.envs.options import DEFAULTS, OBSERVED_WITH, changed_options
@@ -66,6 +67,8 @@ class PolicyAgent:
         self._network = find_algorithm(contents["algorithm"]).load_policy(policy)
         self._row_by_row = "factory" in policy and find_network(policy["factory"]["name"]).row_by_row
         self._mask_actions = bool(policy["mask_actions"])
+        self._has_scores = not self._network.continuous and hasattr(self._network, "scores")
+        self._all_legal = np.ones((1, self._network.action_size), np.bool_)
         self._normalizer: ObservationNormalizer | None = None
         if policy["normalizer"] is not None:
             self._normalizer = ObservationNormalizer(self._network.observation_size)
@@ -122,9 +125,11 @@ class PolicyAgent:
 
     def act(self, observation: Observation, info: Info) -> Action:
         """The action for an observation: its id, or float32 [dimensions] in [-1, 1], or a joint action."""
-        observations, masks = self._seen = self._inputs(observation)
+        rows, legal = self._seen = self._read(observation)
+        if self.deterministic and self._has_scores:
+            return self._as_action(int(self._scores(rows, legal).argmax()))
         with torch.no_grad():
-            actions = self._network.act(observations, masks, None if self.deterministic else self._generator)
+            actions = self._network.act(*_tensors(rows, legal), None if self.deterministic else self._generator)
         if self._network.continuous:
             return self._as_action(actions[0].clamp(-1.0, 1.0).numpy())
         return self._as_action(int(actions[0]))
@@ -160,14 +165,22 @@ class PolicyAgent:
         """What it prefers actions by: ``probability`` or ``value``."""
         return str(self._network.preference)
 
-    def best(self, observation: Observation, k: int) -> tuple[list[Action], list[float]]:
-        """The ``k`` legal discrete actions that it prefers, the best first, and its preferences; fewer if there are."""
-        observations, masks = self._seen = self._inputs(observation)
-        legal = torch.as_tensor(self._env.action_masks()) if masks is None else masks[0]
-        with torch.no_grad():
-            values = self._network.preferences(observations, masks)[0]
-        chosen = values.masked_fill(~legal, -torch.inf).topk(min(k, int(legal.sum())))
-        return [self._as_action(action) for action in chosen.indices.tolist()], chosen.values.tolist()
+    def best(self, observation: Observation, k: int) -> tuple[list[Action], torch.Tensor]:
+        """The ``k`` legal discrete actions that it prefers, the best first, and by what; fewer if there are.
+
+        Of that :meth:`preferences_of` makes probabilities or values.
+        """
+        rows, legal = self._seen = self._read(observation)
+        order = self._order(rows, legal)
+        allowed = self._env.action_masks() if legal is None else legal[0]
+        order.numpy()[~allowed] = -np.inf
+        chosen = order.topk(min(k, int(np.count_nonzero(allowed))))
+        return [self._as_action(action) for action in chosen.indices.tolist()], chosen.values
+
+    def preferences_of(self, order: torch.Tensor) -> list[float]:
+        """What :attr:`preference` names, of what :meth:`best` orders actions by."""
+        of_probabilities = self._has_scores and self.preference == "probability"
+        return (order.exp() if of_probabilities else order).tolist()  # type: ignore[no-any-return]
 
     @property
     def is_deterministic(self) -> bool:
@@ -176,10 +189,10 @@ class PolicyAgent:
 
     def draws(self, observation: Observation, k: int) -> list[Action]:
         """``k`` continuous actions, :data:`WIDTH` times as far from the most probable one as its distribution draws."""
-        observations, masks = self._inputs(observation)
+        observations = torch.from_numpy(self._read(observation)[0])
         with torch.no_grad():
-            probable = self._network.act(observations, masks, None).clamp(-1.0, 1.0)
-            drawn = self._network.act(observations.expand(k, -1), masks, self._generator)
+            probable = self._network.act(observations, None, None).clamp(-1.0, 1.0)
+            drawn = self._network.act(observations.expand(k, -1), None, self._generator)
         actions = (probable + WIDTH * (drawn - probable)).clamp(-1.0, 1.0)
         return [self._as_action(action) for action in actions.numpy()]
 
@@ -187,12 +200,26 @@ class PolicyAgent:
         """Of continuous actions the most probable one, and what is drawn around it, :data:`PROPOSALS` in all."""
         return [self.act(observation, info), *self.draws(observation, PROPOSALS - 1)]
 
-    def _inputs(self, observation: Observation) -> tuple[torch.Tensor, torch.Tensor | None]:
+    def _read(self, observation: Observation) -> tuple[F32, Flags | None]:
         """An observation as the network reads it, and the actions that it may play, each with one row."""
-        if self._normalizer is not None:
-            observation = self._normalizer.normalize(observation)
-        masks = torch.as_tensor(self._env.action_masks()).unsqueeze(0) if self._mask_actions else None
-        return torch.as_tensor(observation, dtype=torch.float32).unsqueeze(0), masks
+        read = (
+            np.array(observation, np.float32) if self._normalizer is None else self._normalizer.normalize(observation)
+        )
+        legal = self._env.action_masks()[np.newaxis] if self._mask_actions else None
+        return read[np.newaxis], legal
+
+    def _scores(self, rows: F32, legal: Flags | None) -> F32:
+        """Log-probabilities or values of discrete actions, [action], as the network says them without tensors."""
+        scores: F32 = self._network.scores(rows, self._all_legal if legal is None else legal)[0]
+        return scores
+
+    def _order(self, rows: F32, legal: Flags | None) -> torch.Tensor:
+        """By which discrete actions are ordered, [action], an array of their own."""
+        if self._has_scores:
+            return torch.from_numpy(self._scores(rows, legal))
+        with torch.no_grad():
+            preferences: torch.Tensor = self._network.preferences(*_tensors(rows, legal))[0].clone()
+        return preferences
 
     def _as_action(self, action: Action) -> Action:
         """What the environment takes, of an action that the policy knows."""
@@ -206,11 +233,14 @@ class PolicyAgent:
         """
         if self._network.continuous or not hasattr(self._network, "preferences"):
             return None
-        with torch.no_grad():
-            values = self._network.preferences(*self._seen)[0]
-        best = values.topk(min(_EXPLAINED, len(values)))
+        order = self._order(*self._seen)
+        best = order.topk(min(_EXPLAINED, len(order)))
         actions = [self._as_action(action) for action in best.indices.tolist()]
-        return Considered(self._network.preference, actions, best.values.tolist())
+        return Considered(self._network.preference, actions, self.preferences_of(best.values))
+
+
+def _tensors(rows: F32, legal: Flags | None) -> tuple[torch.Tensor, torch.Tensor | None]:
+    return torch.from_numpy(rows), None if legal is None else torch.from_numpy(legal)
 
 
 def _flattened(env: gymnasium.Env[Any, Any], continuous: bool) -> JointAsBox | JointAsDiscrete | None:

@@ -45,7 +45,7 @@ from gymnasium.vector import VectorEnv
 from torch import Tensor, nn
 
 from rl2grid.algorithms.hyperparameters import changed_preset
-from rl2grid.algorithms.networks import PER_ACTION, NetworkFactory, Output
+from rl2grid.algorithms.networks import PER_ACTION, NetworkFactory, Output, outputs_of
 from rl2grid.algorithms.off_policy import (
     Batch,
     OffPolicyArgs,
@@ -57,9 +57,10 @@ from rl2grid.algorithms.off_policy import (
     random_legal_actions,
 )
 from rl2grid.algorithms.registry import Algorithm
-from rl2grid.algorithms.sampling import drawn, legal_log_softmax
+from rl2grid.algorithms.sampling import drawn, legal_log_softmax, log_probabilities_of
 from rl2grid.algorithms.starting import StartingPolicy
 from rl2grid.algorithms.teacher import TeacherArgs, divergences
+from rl2grid.arrays import F32, Flags
 from rl2grid.errors import UsageError
 
 # --- Hyperparameters ------------------------------------------------------------------------------------------------
@@ -293,6 +294,10 @@ class CategoricalActor(nn.Module):
         """Probabilities of the actions, [batch, actions]."""
         log_probabilities: Tensor = self(observations, masks)
         return log_probabilities.exp()
+
+    def scores(self, rows: F32, legal: Flags) -> F32:
+        """Log-probabilities of the actions as of :meth:`distribution`, without tensors; all [batch, ...]."""
+        return log_probabilities_of(outputs_of(self.network, rows), legal)
 
 
 class TwinActionCritics(nn.Module):

@@ -7,10 +7,12 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from rl2grid.arrays import F32, Flags
 from rl2grid.dense.choices import (
     NEVER,
     write_choice_gradients,
@@ -30,6 +32,13 @@ def legal_log_softmax(logits: Tensor, masks: Tensor | None) -> Tensor:
     if masks is not None:
         logits = logits.masked_fill(~masks, NEVER)
     return logits.log_softmax(dim=-1)
+
+
+def log_probabilities_of(logits: F32, legal: Flags) -> F32:
+    """What :func:`legal_log_softmax` says, to the bit, without tensors; all [batch, actions]."""
+    log_probabilities = np.empty_like(logits)
+    write_log_softmax(logits, legal, log_probabilities)
+    return log_probabilities
 
 
 def log_probabilities_and_entropies(logits: Tensor, masks: Tensor | None, actions: Tensor) -> tuple[Tensor, Tensor]:
@@ -67,10 +76,7 @@ def _legal(logits: Tensor, masks: Tensor | None) -> Tensor:
 
 
 def _log_softmax(logits: Tensor, legal: Tensor) -> Tensor:
-    rows = logits.detach().contiguous()
-    log_probabilities = torch.empty_like(rows)
-    write_log_softmax(rows.numpy(), legal.numpy(), log_probabilities.numpy())
-    return log_probabilities
+    return torch.from_numpy(log_probabilities_of(logits.detach().contiguous().numpy(), legal.numpy()))
 
 
 class _LogSoftmax(torch.autograd.Function):

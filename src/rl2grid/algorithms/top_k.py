@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import gymnasium
 import numpy as np
+import torch
 
 from rl2grid.agents.agent import Action, Considered, Info, Observation
 from rl2grid.agents.dispatch import worst_loading_if_legal
@@ -42,7 +45,7 @@ class TopK:
         self.name = f"{policy.name}, best of {k}"
         self.task, self.env_keywords = policy.task, policy.env_keywords
         self.identity: dict[str, Any] = {**policy.identity, "top_k": k}
-        self._considered: Considered | None = None
+        self._considered: Callable[[], Considered] | None = None
 
     def bind(self, env: gymnasium.Env[Any, Any]) -> None:
         """Remember the environment, which is asked for forecasts.
@@ -67,9 +70,9 @@ class TopK:
         """The action to play."""
         if self._policy.continuous:
             return self._drawn(observation, info)
-        candidates, preferences = self._policy.best(observation, self._k)
+        candidates, order = self._policy.best(observation, self._k)
         chosen, is_safe = self._choice(candidates)
-        self._considered = Considered(self._policy.preference, candidates, preferences, _why(chosen, is_safe))
+        self._considered = partial(self._compared, candidates, order, _why(chosen, is_safe))
         return candidates[chosen]
 
     def proposals(self, observation: Observation, info: Info) -> list[Action]:
@@ -80,7 +83,10 @@ class TopK:
         """What the last decision compared and why it was played: candidates by the policy's preference, continuous ones
         by the worst loading by the forecast.
         """
-        return self._considered
+        return None if self._considered is None else self._considered()
+
+    def _compared(self, candidates: list[Action], order: torch.Tensor, why: str) -> Considered:
+        return Considered(self._policy.preference, candidates, self._policy.preferences_of(order), why)
 
     def _drawn(self, observation: Observation, info: Info) -> Action:
         """The most probable continuous action if it is safe, else the first that is, or the best, of those drawn."""
@@ -97,7 +103,8 @@ class TopK:
         order = np.argsort(loading, kind="stable").tolist()
         chosen = order[0]
         tried, values = [candidates[k] for k in order], [loading[k] for k in order]
-        self._considered = Considered("worst loading", tried, values, _why(chosen, loading[chosen] < SAFE_RHO))
+        why = _why(chosen, loading[chosen] < SAFE_RHO)
+        self._considered = partial(Considered, "worst loading", tried, values, why)
         return candidates[chosen]
 
     def _choice(self, candidates: list[Action]) -> tuple[int, bool]:

@@ -72,8 +72,11 @@ class ObservationNormalizer:
 
     def normalize(self, observations: NDArray[Any]) -> NDArray[np.float32]:
         """Observations [..., size] as multiples of the standard deviation around the mean, clipped, float32."""
-        scaled = (observations - self.mean) / self.deviation
-        return np.clip(scaled, -CLIP, CLIP).astype(np.float32)
+        scaled = observations - self.mean
+        scaled /= self.deviation
+        np.maximum(scaled, -CLIP, out=scaled)
+        np.minimum(scaled, CLIP, out=scaled)
+        return scaled.astype(np.float32)
 
     def state_dict(self) -> dict[str, Any]:
         """The statistics, as arrays of their own."""

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from rl2grid.algorithms.networks import Network, Request, Style
+from rl2grid.algorithms.networks import Network, Request, Style, outputs_by_tensors
 from rl2grid.arrays import F32, I64
 from rl2grid.dense.layers import (
     LINEAR,
@@ -45,10 +45,22 @@ class Layers(nn.Sequential):
         layers = zip(weights[::2], weights[1::2], activations, strict=True)
         self._frozen = tuple(_frozen_layer(*layer) for layer in layers)
 
+    def outputs_of(self, rows: F32) -> F32:
+        """See :func:`rl2grid.algorithms.networks.outputs_of`."""
+        return self._outputs_of_frozen(rows) if self._frozen else outputs_by_tensors(self, rows)
+
+    def _outputs_of_frozen(self, rows: F32) -> F32:
+        given = rows
+        for layer in self._frozen:
+            outputs = np.empty((len(given), len(layer.bias)), np.float32)
+            write_layer_of_panels(given, layer.panels, layer.bias, layer.activation, outputs)
+            given = outputs
+        return given
+
     def forward(self, inputs: Tensor) -> Tensor:
         """Numbers [..., inputs] -> [..., width]."""
         if self._frozen and not torch.is_grad_enabled() and inputs.dtype == torch.float32:
-            return _outputs_of_frozen(_rows(inputs), self._frozen).view(*inputs.shape[:-1], -1)
+            return torch.from_numpy(self._outputs_of_frozen(_rows(inputs).numpy())).view(*inputs.shape[:-1], -1)
         weights, activations = _weights_and_activations(self._modules.values())
         if not weights or inputs.device.type != "cpu" or inputs.dtype != torch.float32:
             outputs: Tensor = super().forward(inputs)  # type: ignore[no-untyped-call]
@@ -115,16 +127,6 @@ def _frozen_layer(weight: Tensor, bias: Tensor, activation: int) -> _FrozenLayer
     panels = np.empty((n_panels(len(weight)), weight.shape[1], COLUMNS), np.float32)
     write_panels(weight.detach().numpy(), panels)
     return _FrozenLayer(panels, bias.detach().numpy().copy(), activation)
-
-
-def _outputs_of_frozen(inputs: Tensor, layers: Sequence[_FrozenLayer]) -> Tensor:
-    """What the last layer gives, [batch, width]."""
-    given: F32 = inputs.numpy()
-    for layer in layers:
-        outputs = np.empty((len(given), len(layer.bias)), np.float32)
-        write_layer_of_panels(given, layer.panels, layer.bias, layer.activation, outputs)
-        given = outputs
-    return torch.from_numpy(given)
 
 
 class _Dense(torch.autograd.Function):
