@@ -2,9 +2,26 @@
 
 import copy
 import functools
-from unittest import mock
+import os
 
 from rl2grid.engines.reference.extract import make_environment
+
+
+def read_once(read):
+    """``read``, by which a file is read once for all that ask for it in the same way; callers get copies."""
+    contents = {}
+
+    @functools.wraps(read)
+    def copied(file, **options):
+        if not isinstance(file, str | os.PathLike) or not os.path.isfile(file) or options.get("chunksize"):
+            return read(file, **options)
+        about = os.stat(file)
+        name = (os.fspath(file), about.st_mtime_ns, about.st_size, repr(options))
+        if name not in contents:
+            contents[name] = read(file, **options)
+        return copy.deepcopy(contents[name])
+
+    return copied
 
 
 def made_once(make, key):
@@ -15,28 +32,11 @@ def made_once(make, key):
     def copied(*arguments):
         name = key(*arguments)
         if name not in originals:
-            originals[name] = _with_grids_read_once(make, *arguments)
+            originals[name] = make(*arguments)
         return originals[name].copy()
 
     return copied
 
-
-def _with_grids_read_once(make, *arguments):
-    """``make(*arguments)``: to read a grid, of which several environments are made, is more than half of it."""
-    import pandapower  # here: that takes seconds, and most tests need no Grid2Op
-
-    read = pandapower.from_json
-
-    def read_once(file):
-        if file not in _GRIDS:
-            _GRIDS[file] = read(file)
-        return copy.deepcopy(_GRIDS[file])
-
-    with mock.patch.object(pandapower, "from_json", read_once):
-        return make(*arguments)
-
-
-_GRIDS = {}
 
 copied_environment = made_once(make_environment, lambda name: name)
 """The bundled environment of this name, to be changed and closed at will."""
