@@ -108,6 +108,26 @@ def test_networks_without_scores_of_their_own_decide_the_same(name: str, masked:
     env.close()
 
 
+@pytest.mark.parametrize("name", ["bus36-M-R", "bus118-MOB-v0-H1", "bus14-R"])
+def test_networks_without_means_of_their_own_decide_the_same(name: str):
+    told, asked = (load_agent(Path(f"pretrained/{name}")) for _ in range(2))
+    assert told._has_means
+    asked._has_means = False
+    env = gymnasium.make(told.task, split="validation", **told.env_keywords)
+    for agent in (told, asked):
+        agent.bind(env)
+    observation, info = env.reset(seed=3)
+    for _ in range(5):
+        action, expected = (agent.act(observation, info) for agent in (told, asked))
+        np.testing.assert_equal(action, expected)
+        assert type(action) is type(expected)
+        assert getattr(action, "dtype", None) == getattr(expected, "dtype", None)
+        observation, _, terminated, truncated, info = env.step(action)
+        if terminated or truncated:
+            observation, info = env.reset()
+    env.close()
+
+
 @BOTH
 def test_evaluation_repeats_itself_and_changes_nothing(continuous: bool):
     ppo = trained(continuous)

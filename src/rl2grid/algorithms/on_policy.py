@@ -187,6 +187,10 @@ class ActorCritic(nn.Module):
         """Log-probabilities of discrete actions as of :meth:`distribution`, without tensors; all [batch, ...]."""
         return log_probabilities_of(outputs_of(self.actor, rows), legal)
 
+    def means(self, rows: F32) -> F32:
+        """The most probable continuous actions before clipping, without tensors; both [batch, ...]."""
+        return outputs_of(self.actor, rows)
+
     def log_probability_and_entropy(
         self, observations: Tensor, actions: Tensor, masks: Tensor | None
     ) -> tuple[Tensor, Tensor]:

@@ -68,6 +68,7 @@ class PolicyAgent:
         self._row_by_row = "factory" in policy and find_network(policy["factory"]["name"]).row_by_row
         self._mask_actions = bool(policy["mask_actions"])
         self._has_scores = not self._network.continuous and hasattr(self._network, "scores")
+        self._has_means = self._network.continuous and hasattr(self._network, "means")
         self._all_legal = np.ones((1, self._network.action_size), np.bool_)
         self._normalizer: ObservationNormalizer | None = None
         if policy["normalizer"] is not None:
@@ -128,6 +129,8 @@ class PolicyAgent:
         rows, legal = self._seen = self._read(observation)
         if self.deterministic and self._has_scores:
             return self._as_action(int(self._scores(rows, legal).argmax()))
+        if self.deterministic and self._has_means:
+            return self._as_action(self._network.means(rows)[0].clip(-1.0, 1.0))
         with torch.no_grad():
             actions = self._network.act(*_tensors(rows, legal), None if self.deterministic else self._generator)
         if self._network.continuous:
