@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
@@ -13,7 +14,9 @@ import torch
 from toy_grid import SingleToyGrid, ToyGrid
 
 from rl2grid.agents.agent import Agent, RandomizedAgent
+from rl2grid.algorithms import policy_agent
 from rl2grid.algorithms.checkpoint import save_checkpoint
+from rl2grid.algorithms.on_policy import ActorCritic, load_policy
 from rl2grid.algorithms.policy_agent import BEST_FILE, CHECKPOINT_FILE, PolicyAgent, load_agent
 from rl2grid.algorithms.ppo import PPO, Args
 from rl2grid.errors import UsageError
@@ -126,6 +129,27 @@ def test_networks_without_means_of_their_own_decide_the_same(name: str):
         if terminated or truncated:
             observation, info = env.reset()
     env.close()
+
+
+@BOTH
+def test_who_inherits_scores_and_means_but_acts_otherwise_acts(continuous: bool, monkeypatch: pytest.MonkeyPatch):
+    asked = []
+
+    class Counting(ActorCritic):
+        def act(self, observations: Any, masks: Any, generator: Any) -> Any:
+            asked.append(observations)
+            return super().act(observations, masks, generator)
+
+    def load(policy: Any) -> ActorCritic:
+        network = load_policy(policy)
+        network.__class__ = Counting
+        return network
+
+    ppo = trained(continuous)
+    usual = play(PolicyAgent(contents(ppo)), continuous)
+    monkeypatch.setattr(policy_agent, "find_algorithm", lambda name: SimpleNamespace(load_policy=load))
+    np.testing.assert_array_equal(play(PolicyAgent(contents(ppo)), continuous), usual)
+    assert len(asked) == len(usual)
 
 
 @BOTH

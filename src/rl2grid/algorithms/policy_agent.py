@@ -67,8 +67,8 @@ class PolicyAgent:
         self._network = find_algorithm(contents["algorithm"]).load_policy(policy)
         self._row_by_row = "factory" in policy and find_network(policy["factory"]["name"]).row_by_row
         self._mask_actions = bool(policy["mask_actions"])
-        self._has_scores = not self._network.continuous and hasattr(self._network, "scores")
-        self._has_means = self._network.continuous and hasattr(self._network, "means")
+        self._has_scores = not self._network.continuous and _says_by_itself(self._network, "scores")
+        self._has_means = self._network.continuous and _says_by_itself(self._network, "means")
         self._all_legal = np.ones((1, self._network.action_size), np.bool_)
         self._normalizer: ObservationNormalizer | None = None
         if policy["normalizer"] is not None:
@@ -240,6 +240,12 @@ class PolicyAgent:
         best = order.topk(min(_EXPLAINED, len(order)))
         actions = [self._as_action(action) for action in best.indices.tolist()]
         return Considered(self._network.preference, actions, self.preferences_of(best.values))
+
+
+def _says_by_itself(network: torch.nn.Module, name: str) -> bool:
+    """Whether a network says without tensors what it decides: who inherits that, but decides otherwise, does not."""
+    ways = (name, "act", "preferences", "distribution", "forward", "each")
+    return next((way for kind in type(network).__mro__ for way in ways if way in vars(kind)), None) == name
 
 
 def _tensors(rows: F32, legal: Flags | None) -> tuple[torch.Tensor, torch.Tensor | None]:
