@@ -87,15 +87,22 @@ def test_a_loaded_policy_plays_the_deterministic_actions_of_the_trained_one(cont
                 assert agent.act(observation, {}) == int(logits.argmax())
 
 
+def with_and_without(name: str, way: str) -> tuple[PolicyAgent, PolicyAgent, gymnasium.Env[Any, Any]]:
+    """A policy of the package that decides in a way of its own, the same that does not, and where both are bound."""
+    own, asked = (load_agent(Path(f"pretrained/{name}")) for _ in range(2))
+    assert getattr(own, way)
+    setattr(asked, way, False)
+    env = gymnasium.make(own.task, split="validation", **own.env_keywords)
+    for agent in (own, asked):
+        agent.bind(env)
+    return own, asked, env
+
+
 @pytest.mark.parametrize("name", ["bus14-T0", "bus36-MO-v1-T0"])
 @pytest.mark.parametrize("masked", [True, False])
 def test_networks_without_scores_of_their_own_decide_the_same(name: str, masked: bool):
-    scored, asked = (load_agent(Path(f"pretrained/{name}")) for _ in range(2))
-    assert scored._has_scores
-    asked._has_scores = False
-    env = gymnasium.make(scored.task, split="validation", **scored.env_keywords)
+    scored, asked, env = with_and_without(name, "_has_scores")
     for agent in (scored, asked):
-        agent.bind(env)
         agent._mask_actions &= masked
     env.action_space.seed(1)
     observation, info = env.reset(seed=3)
@@ -113,12 +120,7 @@ def test_networks_without_scores_of_their_own_decide_the_same(name: str, masked:
 
 @pytest.mark.parametrize("name", ["bus36-M-R", "bus118-MOB-v0-H1", "bus14-R"])
 def test_networks_without_means_of_their_own_decide_the_same(name: str):
-    told, asked = (load_agent(Path(f"pretrained/{name}")) for _ in range(2))
-    assert told._has_means
-    asked._has_means = False
-    env = gymnasium.make(told.task, split="validation", **told.env_keywords)
-    for agent in (told, asked):
-        agent.bind(env)
+    told, asked, env = with_and_without(name, "_has_means")
     observation, info = env.reset(seed=3)
     for _ in range(5):
         action, expected = (agent.act(observation, info) for agent in (told, asked))

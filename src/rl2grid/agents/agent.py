@@ -155,6 +155,14 @@ def seed_together(agents: Iterable[Agent | None], seed: int, episode: int) -> No
             agent.seed_episode(seed, episode ^ place)
 
 
+def nearest_of(kind: type, *names: str) -> str | None:
+    """Which of some methods a class or its nearest base defines, the first named where one defines several; None: none.
+
+    Who inherits another way to do what it does in a way of its own is to be asked in the latter.
+    """
+    return next((name for base in kind.__mro__ for name in names if name in vars(base)), None)
+
+
 def no_intervention(space: gymnasium.Space[Any]) -> Action:
     """The action that changes nothing: id 0 of a topology task, zeros of a redispatching task, both of a joint task."""
     if isinstance(space, gymnasium.spaces.Dict):

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from rl2grid.agents.agent import Action, Actions, Considered, Info, Observation
+from rl2grid.agents.agent import Action, Actions, Considered, Info, Observation, nearest_of
 from rl2grid.algorithms.checkpoint import load_checkpoint
 from rl2grid.algorithms.networks import find_network
 from rl2grid.algorithms.networks.mlp import freeze
@@ -244,8 +244,7 @@ class PolicyAgent:
 
 def _says_by_itself(network: torch.nn.Module, name: str) -> bool:
     """Whether a network says without tensors what it decides: who inherits that, but decides otherwise, does not."""
-    ways = (name, "act", "preferences", "distribution", "forward", "each")
-    return next((way for kind in type(network).__mro__ for way in ways if way in vars(kind)), None) == name
+    return nearest_of(type(network), name, "act", "preferences", "distribution", "forward", "each") == name
 
 
 def _tensors(rows: F32, legal: Flags | None) -> tuple[torch.Tensor, torch.Tensor | None]:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from rl2grid.agents.agent import Actions, Agent, SideBySideAgent, no_intervention, repeated
+from rl2grid.agents.agent import Actions, Agent, SideBySideAgent, nearest_of, no_intervention, repeated
 from rl2grid.arrays import I64
 from rl2grid.envs.native_rows import NativeRows
 from rl2grid.envs.options import TaskOptions
@@ -37,9 +37,8 @@ def _decides_side_by_side(agent: Agent) -> bool:
     """Whether it does, and not by inheritance from an agent that acts otherwise, or by a word for another."""
     if "act" in getattr(agent, "__dict__", ()):
         return False
-    ways = ("act_side_by_side", "act")
-    first = next((way for kind in type(agent).__mro__ for way in ways if way in vars(kind)), None)
-    return first == ways[0] and isinstance(agent, SideBySideAgent) and agent.decides_side_by_side
+    nearest = nearest_of(type(agent), "act_side_by_side", "act")
+    return nearest == "act_side_by_side" and isinstance(agent, SideBySideAgent) and agent.decides_side_by_side
 
 
 class SideBySidePlayer:

@@ -249,7 +249,6 @@ class _Shortlisted(nn.Module):
             actions = actions.take(chosen.astype(np.int32))
         self.network = build(replace(request, spec=replace(spec, action_size=len(chosen), actions=actions)))
         self.output, self.n_actions = request.output, spec.action_size
-        self._places = chosen
         self.register_buffer("chosen", torch.from_numpy(chosen), persistent=False)
 
     chosen: Tensor
@@ -276,7 +275,7 @@ class _Shortlisted(nn.Module):
         numbers = outputs_of(self.network, rows)
         first, per_action = self.output.per_state, self.output.per_action
         every = np.full((len(rows), per_action, self.n_actions), NEVER, np.float32)
-        every[:, :, self._places] = numbers[:, first:].reshape(len(rows), per_action, -1)
+        every[:, :, self.chosen.numpy()] = numbers[:, first:].reshape(len(rows), per_action, -1)
         return np.concatenate((numbers[:, :first], every.reshape(len(rows), -1)), axis=1)
 
 
