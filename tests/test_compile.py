@@ -3,14 +3,17 @@
 import ast
 import functools
 from pathlib import Path
+from typing import Annotated, NamedTuple
 
 import numba
 import numpy as np
 import pytest
 
 from rl2grid import compile as compile_module
-from rl2grid.arrays import I64
+from rl2grid.arrays import F64, I32, I64
 from rl2grid.compile import INTERPRETED_LAYERS, INTERPRETED_MODULES, jit
+from rl2grid.handles import Handle, opener
+from rl2grid.structures import allocate, constant, row
 
 PACKAGE = Path(compile_module.__file__).parent
 
@@ -30,6 +33,61 @@ def test_literals_of_callers_compile_a_function_once() -> None:
     assert _chosen_by_literals.py_func(np.arange(5, 8), 2) == _chosen_by_literals(np.arange(5, 8), 2) == 10 + 6 + 14
     types = {signature[1:] for signature in _chosen.signatures}  # type: ignore[attr-defined]
     assert types == {(numba.int64, numba.boolean)}
+
+
+class _Limits(NamedTuple):
+    limit: Annotated[F64, constant("line")]
+
+
+class _Lines(NamedTuple):
+    load: Annotated[I32, row("line")]
+    limits: _Limits
+
+
+class _Undeclared(NamedTuple):
+    limit: F64
+
+
+_open_lines = opener(_Lines)
+
+
+@jit
+def _overloads(lines: _Lines, i: int) -> int:
+    return int((lines.load[i] > lines.limits.limit).sum())
+
+
+@jit
+def _overloads_at(address: int, i: int) -> int:
+    return _overloads(_open_lines(address), i)
+
+
+@jit
+def _raised(limits: _Undeclared, by: float) -> float:
+    return float(limits.limit.max()) + by
+
+
+@pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled")
+def test_structures_from_python_and_of_callers_compile_a_function_once() -> None:
+    limits = allocate(_Limits, {"line": 3}, limit=np.array([1.0, 2.0, 3.0]))
+    lines = allocate(_Lines, {"line": 3}, 2, limits=limits, load=np.array([[1, 3, 5], [9, 9, 3]], np.int32))
+    assert [_overloads(lines, i) for i in (0, 1)] == [_overloads.py_func(lines, i) for i in (0, 1)] == [2, 2]  # type: ignore[attr-defined]
+    handle = Handle(lines)
+    assert _overloads_at(handle.address, 0) == _overloads(handle, 1) == 2  # type: ignore[arg-type]
+    assert len(_overloads.signatures) == 1  # type: ignore[attr-defined]
+    lines.load[1] = 0
+    assert _overloads(lines, 1) == 0
+
+
+@pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled")
+def test_a_structure_from_python_is_what_it_was_declared_as() -> None:
+    limits = allocate(_Limits, {"line": 3})
+    turned = np.zeros((3, 2), np.int32).T
+    with pytest.raises(TypeError, match=r"_Lines.load has to be a contiguous int32 array with 2 axes"):
+        _overloads(_Lines(turned, limits), 0)
+
+
+def test_a_tuple_that_is_no_structure_is_compiled_as_one_array_after_the_other() -> None:
+    assert _raised(_Undeclared(np.array([0.5, 2.0])), 1) == 3
 
 
 def _compiles(source: Path) -> bool:

@@ -20,6 +20,7 @@ from numba.core.types.misc import unliteral
 from rl2grid import compile_notices
 from rl2grid.compiled_files import keep_code_of
 from rl2grid.compiled_parts import Pipeline, part_for_compiled_callers
+from rl2grid.handles import is_to_be_opened, opened
 
 compile_notices.install()
 
@@ -66,6 +67,7 @@ def jit(function: Function) -> Function:
     keep_code_of(compiled, cache_directory())
     part_for_compiled_callers(compiled)
     _take_literals_as_numbers(compiled)
+    _take_structures_as_opened(compiled)
     return compiled
 
 
@@ -101,3 +103,23 @@ def _take_literals_as_numbers(compiled: Any) -> None:
         return typed(tuple(map(unliteral, args)), {name: unliteral(kind) for name, kind in kws.items()})
 
     compiled.get_call_template = get_call_template
+
+
+def _take_structures_as_opened(compiled: Any) -> None:
+    """Compile a function once for a structure, whether compiled code or Python hands it over.
+
+    For Numba the NamedTuple is a type of its own, and all of its arrays are arguments: the function and all that it
+    calls would be compiled again, for several times as long.
+    """
+    if not hasattr(compiled, "_compile_for_args"):  # Numba is told not to compile
+        return
+    compile_for = compiled._compile_for_args
+
+    def call_opened(*arguments: Any) -> Any:
+        return compiled(*map(opened, arguments))
+
+    def compile_for_args(*arguments: Any) -> Any:
+        """What Numba calls, with the same arguments."""
+        return call_opened if any(map(is_to_be_opened, arguments)) else compile_for(*arguments)
+
+    compiled._compile_for_args = compile_for_args

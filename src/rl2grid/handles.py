@@ -7,8 +7,8 @@ address of the table into a value whose attributes are the arrays, so that funct
 (``state.rho[i, line]``) compile for it unchanged. A field may be a structure itself
 (``environments.state.rho[i, line]``): all that an engine works with is then one number, passed on for nothing.
 
-A function that takes an opened structure can be called from Python too, with what :class:`AsOpened` makes of one:
-handed a NamedTuple, it and all that it calls would be compiled a second time.
+A function that takes an opened structure can be called from Python with the NamedTuple too, of which a handle is made
+(:func:`opened`). Who calls often keeps one (:class:`AsOpened`), which Numba recognises in a tenth of the time.
 
 The handle must be kept for as long as its address is used, and the arrays must not be replaced.
 """
@@ -18,6 +18,7 @@ from __future__ import annotations
 import copy
 import functools
 import hashlib
+from collections import deque
 from collections.abc import Callable
 from typing import Any, Generic, cast
 
@@ -40,7 +41,7 @@ from numba.core.typing.templates import AttributeTemplate, infer_getattr
 from numba.np.arrayobj import make_array, populate_array
 from numba.np.numpy_support import from_dtype
 
-from rl2grid.structures import Role, Structure, blank_row, blanks_of, check, copy_row, declaration_of
+from rl2grid.structures import Role, Structure, blank_row, blanks_of, check, copy_row, declaration_of, is_structure
 
 _WORD = ir.IntType(64)
 
@@ -60,7 +61,7 @@ class Handle(Generic[Structure]):
         words: list[int] = []
         for name in declaration.fields:
             array = getattr(structure, name)
-            words += [array.ctypes.data, *array.shape]
+            words += [array.__array_interface__["data"][0], *array.shape]  # array.ctypes takes ten times as long
         self._first_part = len(words)
         words += [part.address for part in self._parts.values()]
         self._table = np.array(words, np.int64)
@@ -116,6 +117,31 @@ def _unbox_handle(handle: HandleType, value: Any, context: Any) -> Any:
     number = context.pyapi.long_as_longlong(address)
     context.pyapi.decref(address)
     return NativeValue(number)
+
+
+_LAST: deque[Handle[Any]] = deque(maxlen=4)
+"""Handles that were made for Python: to make one takes longer than most functions."""
+
+
+def is_to_be_opened(argument: object) -> bool:
+    """Whether compiled functions take it as a handle."""
+    return isinstance(argument, tuple) and is_structure(type(argument))
+
+
+def opened(argument: Any) -> Any:
+    """A structure as a handle, and anything else as it is.
+
+    Raises:
+        TypeError: an array of a structure is not what was declared.
+    """
+    if not is_to_be_opened(argument):
+        return argument
+    for handle in tuple(_LAST):  # another thread may add to them
+        if handle.structure is argument:
+            return handle
+    handle = Handle(argument)
+    _LAST.append(handle)
+    return handle
 
 
 class AsOpened(Generic[Structure]):

@@ -148,6 +148,18 @@ def declaration_of(kind: type[tuple[Any, ...]]) -> Declaration:
     return Declaration(fields, parts)
 
 
+@functools.cache
+def is_structure(kind: type[object]) -> bool:
+    """Whether it is a NamedTuple all fields of which are declared."""
+    if not issubclass(kind, tuple) or not hasattr(kind, "_fields"):
+        return False
+    try:
+        declaration = declaration_of(kind)
+    except TypeError:
+        return False
+    return all(map(is_structure, declaration.parts.values()))
+
+
 def _dtype_of(array: Any) -> np.dtype[Any]:
     """The dtype of ``NDArray[scalar]``, which up to NumPy 2.4 is another name of ``ndarray[shape, dtype[scalar]]``."""
     last = get_args(array)[-1]
