@@ -20,7 +20,8 @@ from numba.core.types.misc import unliteral
 from rl2grid import compile_notices
 from rl2grid.compiled_files import keep_code_of
 from rl2grid.compiled_parts import Pipeline, part_for_compiled_callers
-from rl2grid.handles import is_to_be_opened, opened
+from rl2grid.handles import opened
+from rl2grid.structures import is_structure
 
 compile_notices.install()
 
@@ -120,6 +121,6 @@ def _take_structures_as_opened(compiled: Any) -> None:
 
     def compile_for_args(*arguments: Any) -> Any:
         """What Numba calls, with the same arguments."""
-        return call_opened if any(map(is_to_be_opened, arguments)) else compile_for(*arguments)
+        return call_opened if any(map(is_structure, map(type, arguments))) else compile_for(*arguments)
 
     compiled._compile_for_args = compile_for_args

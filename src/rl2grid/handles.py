@@ -123,18 +123,13 @@ _LAST: deque[Handle[Any]] = deque(maxlen=4)
 """Handles that were made for Python: to make one takes longer than most functions."""
 
 
-def is_to_be_opened(argument: object) -> bool:
-    """Whether compiled functions take it as a handle."""
-    return isinstance(argument, tuple) and is_structure(type(argument))
-
-
 def opened(argument: Any) -> Any:
     """A structure as a handle, and anything else as it is.
 
     Raises:
         TypeError: an array of a structure is not what was declared.
     """
-    if not is_to_be_opened(argument):
+    if not (isinstance(argument, tuple) and is_structure(type(argument))):
         return argument
     for handle in tuple(_LAST):  # another thread may add to them
         if handle.structure is argument:
