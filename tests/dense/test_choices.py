@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from rl2grid.algorithms.sampling import legal_log_softmax, log_probabilities_and_entropies
+from rl2grid.dense.choices import find_best
 
 SHAPES = [(1, 1), (3, 2), (256, 50), (5, 1000)]
 
@@ -76,3 +77,20 @@ def test_only_what_is_not_a_number_spoils_its_row():
     logits[1, 2] = math.nan
     spoiled = legal_log_softmax(logits, None).isnan()
     assert spoiled.tolist() == [[False] * 4, [True] * 4, [False] * 4]
+
+
+@pytest.mark.parametrize("n_best", [1, 10, 300, 999, 1000, 2500])
+@pytest.mark.parametrize("n_values", [3, 1_000_000])
+def test_the_best_are_those_of_a_stable_sort(n_values, n_best):
+    """Of few different values most are equal."""
+    random = np.random.default_rng(n_best)
+    for n_actions in (n_best, n_best + 1, 4000):
+        values = random.integers(n_values, size=n_actions).astype(np.float32)
+        for share in (0.0, 0.05, 1.0):
+            allowed = random.random(n_actions) < share
+            best = np.full(n_best, -1, np.int32)
+            found = find_best(values, allowed, best)
+            order = np.argsort(-values, kind="stable")
+            expected = order[allowed[order]][:n_best]
+            assert best[:found].tolist() == expected.tolist()
+            assert (best[found:] == -1).all()

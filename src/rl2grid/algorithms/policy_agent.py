@@ -21,6 +21,7 @@ from rl2grid.algorithms.networks.mlp import freeze
 from rl2grid.algorithms.pretrained import PREFIX, is_pretrained, pretrained
 from rl2grid.algorithms.registry import find_algorithm
 from rl2grid.arrays import F32, Flags
+from rl2grid.dense.choices import find_best
 from rl2grid.envs.joint import JointAsBox, JointAsDiscrete
 from rl2grid.envs.normalization import ObservationNormalizer
 from rl2grid.envs.options import DEFAULTS, OBSERVED_WITH, changed_options
@@ -168,22 +169,24 @@ class PolicyAgent:
         """What it prefers actions by: ``probability`` or ``value``."""
         return str(self._network.preference)
 
-    def best(self, observation: Observation, k: int) -> tuple[list[Action], torch.Tensor]:
+    def best(self, observation: Observation, k: int) -> tuple[list[Action], F32]:
         """The ``k`` legal discrete actions that it prefers, the best first, and by what; fewer if there are.
 
         Of that :meth:`preferences_of` makes probabilities or values.
         """
         rows, legal = self._seen = self._read(observation)
-        order = self._order(rows, legal)
-        allowed = self._env.action_masks() if legal is None else legal[0]
-        order.numpy()[~allowed] = -np.inf
-        chosen = order.topk(min(k, int(np.count_nonzero(allowed))))
-        return [self._as_action(action) for action in chosen.indices.tolist()], chosen.values
+        return self._best_of(self._order(rows, legal), self._env.action_masks() if legal is None else legal[0], k)
 
-    def preferences_of(self, order: torch.Tensor) -> list[float]:
+    def _best_of(self, order: F32, allowed: Flags, k: int) -> tuple[list[Action], F32]:
+        """The ``k`` actions that come first by an order of those that are allowed, and by what."""
+        best = np.empty(min(k, len(order)), np.int32)
+        chosen = best[: find_best(order, allowed, best)]
+        return [self._as_action(action) for action in chosen.tolist()], order[chosen]
+
+    def preferences_of(self, order: F32) -> list[float]:
         """What :attr:`preference` names, of what :meth:`best` orders actions by."""
         of_probabilities = self._has_scores and self.preference == "probability"
-        return (order.exp() if of_probabilities else order).tolist()  # type: ignore[no-any-return]
+        return (torch.from_numpy(order).exp() if of_probabilities else order).tolist()
 
     @property
     def is_deterministic(self) -> bool:
@@ -216,12 +219,12 @@ class PolicyAgent:
         scores: F32 = self._network.scores(rows, self._all_legal if legal is None else legal)[0]
         return scores
 
-    def _order(self, rows: F32, legal: Flags | None) -> torch.Tensor:
-        """By which discrete actions are ordered, [action], an array of their own."""
+    def _order(self, rows: F32, legal: Flags | None) -> F32:
+        """By which discrete actions are ordered, [action]."""
         if self._has_scores:
-            return torch.from_numpy(self._scores(rows, legal))
+            return self._scores(rows, legal)
         with torch.no_grad():
-            preferences: torch.Tensor = self._network.preferences(*_tensors(rows, legal))[0].clone()
+            preferences: F32 = self._network.preferences(*_tensors(rows, legal))[0].numpy()
         return preferences
 
     def _as_action(self, action: Action) -> Action:
@@ -236,10 +239,8 @@ class PolicyAgent:
         """
         if self._network.continuous or not hasattr(self._network, "preferences"):
             return None
-        order = self._order(*self._seen)
-        best = order.topk(min(_EXPLAINED, len(order)))
-        actions = [self._as_action(action) for action in best.indices.tolist()]
-        return Considered(self._network.preference, actions, self.preferences_of(best.values))
+        actions, order = self._best_of(self._order(*self._seen), self._all_legal[0], _EXPLAINED)
+        return Considered(self._network.preference, actions, self.preferences_of(order))
 
 
 def _says_by_itself(network: torch.nn.Module, name: str) -> bool:

@@ -8,11 +8,11 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-import torch
 
 from rl2grid.agents.agent import Action, Considered, Info, Observation
 from rl2grid.agents.dispatch import worst_loading_if_legal
 from rl2grid.algorithms.policy_agent import PolicyAgent
+from rl2grid.arrays import F32
 from rl2grid.errors import UsageError
 from rl2grid.mdp.heuristics import SAFE_RHO
 
@@ -85,7 +85,7 @@ class TopK:
         """
         return None if self._considered is None else self._considered()
 
-    def _compared(self, candidates: list[Action], order: torch.Tensor, why: str) -> Considered:
+    def _compared(self, candidates: list[Action], order: F32, why: str) -> Considered:
         return Considered(self._policy.preference, candidates, self._policy.preferences_of(order), why)
 
     def _drawn(self, observation: Observation, info: Info) -> Action:

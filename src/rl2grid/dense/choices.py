@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rl2grid.arrays import F32, I64, Flags
+from rl2grid.arrays import F32, I32, I64, Flags, Index
 from rl2grid.compile import borrowing_jit, jit
 
 NEVER = -1e8
@@ -25,6 +25,8 @@ _LOG_2_LOW = np.float32(_LOG_2 - 0.693359375)
 _LEAST = np.float32(-87.0)
 """Below it, the exponential is as good as zero."""
 _ROOT_OF_HALF = 0.7071067811865476
+_MANY = 1000
+"""As many are found by sorting all."""
 
 
 @jit
@@ -87,6 +89,48 @@ def write_choice_gradients(
             gradient = -exponential(own[action]) * (first + second * (own[action] + entropy))
             logits[row, action] = gradient if legal[row, action] else np.float32(0.0)
         logits[row, actions[row]] += first
+
+
+@jit
+def find_best(values: F32, allowed: Flags, best: I32) -> Index:
+    """Find the allowed actions with the largest values.
+
+    Args:
+        values: [action], no matter of which those that are not allowed.
+        allowed: [action].
+        best: [place], not more than there are actions, is written: the actions, the largest value first, of equal ones
+            the first action first.
+
+    Returns:
+        How many places are written: all, or one for each that is allowed.
+    """
+    if best.shape[0] >= _MANY:
+        return _sort_best(values, allowed, best)
+    found: Index = 0
+    for action in range(values.shape[0]):
+        if not allowed[action]:
+            continue
+        if found == best.shape[0] and not values[action] > values[best[found - 1]]:
+            continue
+        place = min(found, best.shape[0] - 1)
+        while place > 0 and values[action] > values[best[place - 1]]:
+            best[place] = best[place - 1]
+            place -= 1
+        best[place] = action
+        found = min(found + 1, best.shape[0])
+    return found
+
+
+@jit
+def _sort_best(values: F32, allowed: Flags, best: I32) -> Index:
+    """What :func:`find_best` does, of many places."""
+    order = np.argsort(-values, kind="mergesort")
+    found: Index = 0
+    for k in range(order.shape[0]):
+        if allowed[order[k]] and found < best.shape[0]:
+            best[found] = order[k]
+            found += 1
+    return found
 
 
 @borrowing_jit

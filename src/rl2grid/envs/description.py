@@ -74,7 +74,7 @@ def action_numbers(actions: Sequence[Any], n_actions: int) -> Ids:
         UsageError: one of them is not an integer in 0 .. n_actions - 1.
     """
     array = np.asarray(actions)
-    if array.ndim == 1 and np.issubdtype(array.dtype, np.integer) and ((array >= 0) & (array < n_actions)).all():
+    if array.ndim == 1 and array.dtype.kind in "iu" and len(array) and array.min() >= 0 and array.max() < n_actions:
         return array.astype(np.int32)
     return np.array([action_number(action, n_actions) for action in actions], np.int32)
 
