@@ -73,9 +73,11 @@ def action_numbers(actions: Sequence[Any], n_actions: int) -> Ids:
     Raises:
         UsageError: one of them is not an integer in 0 .. n_actions - 1.
     """
-    array = np.asarray(actions)
-    if array.ndim == 1 and array.dtype.kind in "iu" and len(array) and array.min() >= 0 and array.max() < n_actions:
-        return array.astype(np.int32)
+    if isinstance(actions, np.ndarray) and actions.ndim == 1 and actions.dtype.kind in "iu":
+        if ((actions >= 0) & (actions < n_actions)).all():
+            return actions.astype(np.int32)
+    elif all(type(action) is int and 0 <= action < n_actions for action in actions):
+        return np.array(actions, np.int32)  # as a policy's best come: no array is asked
     return np.array([action_number(action, n_actions) for action in actions], np.int32)
 
 

@@ -187,7 +187,7 @@ class NativeEngine:
             finish_simulation_one(self._simulated.address)
         return self._simulated.structure.state
 
-    def foresee(self, i: int, horizon: int) -> Environments | None:
+    def foresee(self, i: int, horizon: int) -> Handle[Environments] | None:
         """What :meth:`simulate` hands to the power flow when nobody acts.
 
         Returns:
@@ -200,7 +200,7 @@ class NativeEngine:
         if not self._begin_simulation(i, DO_NOTHING, horizon):
             return None
         set_generators_one(self._simulated.address, 0)
-        return self._simulated.structure
+        return self._simulated
 
     def close(self) -> None:
         """Let go of the series."""

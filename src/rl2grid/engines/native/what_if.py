@@ -11,13 +11,14 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from rl2grid.arrays import F32, I8, I32, Flags
+from rl2grid.arrays import F32, I8, I32, U64, Flags
+from rl2grid.compile import jit
 from rl2grid.engines.native.engine import NativeEngine
-from rl2grid.engines.native.environments import Environments
+from rl2grid.engines.native.environments import Environments, open_environments
 from rl2grid.engines.native.threads import Threads
 from rl2grid.errors import UsageError
 from rl2grid.grids import Grid
-from rl2grid.handles import Handle
+from rl2grid.handles import Handle, opener
 from rl2grid.mdp.actions import ActionCatalogue, ActionKind, Ids
 from rl2grid.mdp.termination import GameOver
 from rl2grid.powerflow.batch import (
@@ -42,6 +43,8 @@ _SMALLEST_PART = 64
 _FEW = 128
 """Changes of a question whose arrays are kept for the next one of its size."""
 _DISPATCH = int(GameOver.DISPATCH)
+_NO_TOPOLOGY = "A what-if is for actions of kind NOTHING, MOVE and SWITCH; others have no topology."
+_open_snapshot, _open_changes = opener(Snapshot), opener(Changes)
 
 
 class Moment(enum.Enum):
@@ -124,6 +127,7 @@ class WhatIf:
         self._network = load_network(grid) if network is None else network
         wiring = new_wiring(grid, self._network)
         self._snapshot = new_snapshot(grid)
+        self._point = Handle(self._snapshot)
         self._solvers = [BatchSolver(grid, self._network, wiring, self._snapshot) for _ in range(num_threads)]
         self._threads = Threads(num_threads, "what-if")
         self._rooms: dict[tuple[int, ...], _Room] = {}
@@ -160,10 +164,23 @@ class WhatIf:
         Raises:
             UsageError: no action, or one of another kind.
         """
+        self._write_snapshot(snapshot)
+        return self._first_safe(catalogue, ids, limit)
+
+    def first_safe_in(
+        self, environments: Handle[Environments], i: int, catalogue: ActionCatalogue, ids: Ids, limit: float
+    ) -> FirstSafe:
+        """What :meth:`first_safe` says of the operating point of environment ``i`` as it is."""
+        _write_point(environments.address, i, self._point.address)
+        return self._first_safe(catalogue, ids, limit)
+
+    def _first_safe(self, catalogue: ActionCatalogue, ids: Ids, limit: float) -> FirstSafe:
+        """:meth:`first_safe`, of the operating point that was taken over."""
         if not len(ids):
             raise UsageError("A safe action is found among some: give at least one.")
-        self._write_snapshot(snapshot)
-        room = self._room_of(_changes_of(catalogue, ids))
+        room = self._room((len(ids), catalogue.mask.shape[1]))
+        if not _write_changes(catalogue.kind, catalogue.target, catalogue.mask, ids, room.changes.address):
+            raise UsageError(_NO_TOPOLOGY)
         place = self._solvers[0].find_safe(room.changes, room.outcomes, limit, room.company)
         worst = float(room.outcomes.structure.worst_loading[place])
         return FirstSafe(place, worst, worst < limit)
@@ -215,13 +232,17 @@ class WhatIf:
             np.copyto(kept, array)
 
     def _room_of(self, changes: Changes) -> _Room:
-        """Room that holds the changes: kept for few of them, of which there will be more."""
-        shape = changes.mask.shape
+        """Room that holds the changes."""
+        room = self._room(changes.mask.shape)
+        asked = room.changes.structure
+        asked.kind[:], asked.target[:], asked.mask[:] = changes
+        return room
+
+    def _room(self, shape: tuple[int, ...]) -> _Room:
+        """Room for changes whose masks have a shape: kept for few of them, of which there will be more."""
         room = self._rooms.get(shape) or _new_room(shape, self.grid.n_line)
         if shape[0] <= _FEW:
             self._rooms[shape] = room
-        asked = room.changes.structure
-        asked.kind[:], asked.target[:], asked.mask[:] = changes
         return room
 
     def _solve(self, asked: Handle[Changes], outcomes: Handle[ChangeOutcomes]) -> None:
@@ -291,10 +312,10 @@ def first_safe(engine: NativeEngine, i: int, catalogue: ActionCatalogue, ids: Id
 
     Where the generators cannot follow the forecast, it is the first.
     """
-    point = _foreseen(engine, i)
-    if point is None:
+    foreseen = engine.foresee(i, 1)
+    if foreseen is None:
         return FirstSafe(0, np.inf, False)
-    return _solver_of(engine, 1).first_safe(point, catalogue, ids, limit)
+    return _solver_of(engine, 1).first_safe_in(foreseen, 0, catalogue, ids, limit)
 
 
 def outages(engine: NativeEngine, i: int) -> OutageOutcomes:
@@ -329,7 +350,7 @@ def _present(engine: NativeEngine, i: int) -> Snapshot:
 def _foreseen(engine: NativeEngine, i: int, horizon: int = 1) -> Snapshot | None:
     """What :func:`forecast_of` copies: it is there until the next simulation."""
     foreseen = engine.foresee(i, horizon)
-    return None if foreseen is None else _point_of(foreseen, 0)
+    return None if foreseen is None else _point_of(foreseen.structure, 0)
 
 
 def _point_of(environments: Environments, i: int) -> Snapshot:
@@ -363,8 +384,53 @@ def _changes_of(catalogue: ActionCatalogue, ids: Ids | None) -> Changes:
         kind, target, mask = kind[ids], target[ids], mask[ids]
     kind = _KINDS[kind]
     if (kind < 0).any():
-        raise UsageError("A what-if is for actions of kind NOTHING, MOVE and SWITCH; others have no topology.")
+        raise UsageError(_NO_TOPOLOGY)
     return Changes(kind, target, mask)
+
+
+@jit
+def _write_point(environments: int, i: int, snapshot: int) -> None:
+    """Take over what :func:`_point_of` tells of an environment; addresses of handles."""
+    opened, point = open_environments(environments), _open_snapshot(snapshot)
+    state, hidden = opened.state, opened.hidden
+    for k in range(point.topo_vect.shape[0]):
+        point.topo_vect[k] = state.topo_vect[i, k]
+        point.last_bus[k] = hidden.last_bus[i, k]
+    for k in range(point.cooldown_line.shape[0]):
+        point.cooldown_line[k] = state.time_before_cooldown_line[i, k]
+    for k in range(point.cooldown_sub.shape[0]):
+        point.cooldown_sub[k] = state.time_before_cooldown_sub[i, k]
+    for k in range(point.gen_p.shape[0]):
+        point.gen_p[k] = hidden.gen_p[i, k]
+        point.gen_v[k] = np.float32(hidden.gen_v[i, k])
+    for k in range(point.load_p.shape[0]):
+        point.load_p[k] = hidden.load_p[i, k]
+        point.load_q[k] = hidden.load_q[i, k]
+    for k in range(point.storage_p.shape[0]):
+        point.storage_p[k] = state.storage_power[i, k]
+
+
+@jit
+def _write_changes(kind: I8, target: I32, mask: U64, ids: I32, changes: int) -> bool:
+    """Write what actions change, as :func:`_changes_of` tells; False: one of them changes no topology.
+
+    Args:
+        kind: of the catalogue, as the others.
+        target: likewise.
+        mask: likewise.
+        ids: of the actions.
+        changes: address of the handle to as many changes.
+    """
+    asked = _open_changes(changes)
+    for k in range(ids.shape[0]):
+        action = ids[k]
+        asked.kind[k] = _KINDS[kind[action]]
+        asked.target[k] = target[action]
+        for word in range(mask.shape[1]):
+            asked.mask[k, word] = mask[action, word]
+        if asked.kind[k] < 0:
+            return False
+    return True
 
 
 def legal_changes(snapshot: Snapshot, changes: Changes) -> Flags:
