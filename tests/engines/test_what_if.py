@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import io
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -174,6 +175,17 @@ def test_a_safe_action_is_found_among_some() -> None:
     engine = played("bus14", 1)
     with pytest.raises(UsageError, match="give at least one"):
         first_safe(engine, 0, full_catalogue(engine.grid), np.zeros(0, np.int32), 0.95)
+
+
+def test_what_is_no_topology_action_of_the_catalogue_is_refused() -> None:
+    engine = played("bus14", 1)
+    catalogue = full_catalogue(engine.grid)
+    for wrong in (-1, len(catalogue)):
+        with pytest.raises(UsageError, match=f"Action {wrong} is none of the catalogue: give numbers from 0 to"):
+            first_safe(engine, 0, catalogue, np.array([0, wrong], np.int32), 0.95)
+    other = replace(catalogue, kind=np.full_like(catalogue.kind, ActionKind.RECONNECT))
+    with pytest.raises(UsageError, match="others have no topology"):
+        first_safe(engine, 0, other, np.array([0], np.int32), 0.95)
 
 
 def test_a_stored_snapshot_answers_as_the_engine_does() -> None:

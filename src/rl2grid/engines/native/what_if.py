@@ -162,7 +162,7 @@ class WhatIf:
             limit: share of the thermal limits.
 
         Raises:
-            UsageError: no action, or one of another kind.
+            UsageError: no action, or one of another kind or that the catalogue lacks.
         """
         self._write_snapshot(snapshot)
         return self._first_safe(catalogue, ids, limit)
@@ -179,8 +179,9 @@ class WhatIf:
         if not len(ids):
             raise UsageError("A safe action is found among some: give at least one.")
         room = self._room((len(ids), catalogue.mask.shape[1]))
-        if not _write_changes(catalogue.kind, catalogue.target, catalogue.mask, ids, room.changes.address):
-            raise UsageError(_NO_TOPOLOGY)
+        written = _write_changes(catalogue.kind, catalogue.target, catalogue.mask, ids, room.changes.address)
+        if written < len(ids):
+            raise _refusal(catalogue, int(ids[written]))
         place = self._solvers[0].find_safe(room.changes, room.outcomes, limit, room.company)
         worst = float(room.outcomes.structure.worst_loading[place])
         return FirstSafe(place, worst, worst < limit)
@@ -411,8 +412,8 @@ def _write_point(environments: int, i: int, snapshot: int) -> None:
 
 
 @jit
-def _write_changes(kind: I8, target: I32, mask: U64, ids: I32, changes: int) -> bool:
-    """Write what actions change, as :func:`_changes_of` tells; False: one of them changes no topology.
+def _write_changes(kind: I8, target: I32, mask: U64, ids: I32, changes: int) -> int:
+    """Write what actions change, as :func:`_changes_of` tells.
 
     Args:
         kind: of the catalogue, as the others.
@@ -420,17 +421,27 @@ def _write_changes(kind: I8, target: I32, mask: U64, ids: I32, changes: int) -> 
         mask: likewise.
         ids: of the actions.
         changes: address of the handle to as many changes.
+
+    Returns:
+        How many are written: all, or those before the first that the catalogue lacks or that changes no topology.
     """
     asked = _open_changes(changes)
     for k in range(ids.shape[0]):
         action = ids[k]
+        if action < 0 or action >= kind.shape[0] or _KINDS[kind[action]] < 0:
+            return k
         asked.kind[k] = _KINDS[kind[action]]
         asked.target[k] = target[action]
         for word in range(mask.shape[1]):
             asked.mask[k, word] = mask[action, word]
-        if asked.kind[k] < 0:
-            return False
-    return True
+    return len(ids)
+
+
+def _refusal(catalogue: ActionCatalogue, action: int) -> UsageError:
+    """Why nothing can be asked about an action."""
+    if 0 <= action < len(catalogue):
+        return UsageError(_NO_TOPOLOGY)
+    return UsageError(f"Action {action} is none of the catalogue: give numbers from 0 to {len(catalogue) - 1}.")
 
 
 def legal_changes(snapshot: Snapshot, changes: Changes) -> Flags:
