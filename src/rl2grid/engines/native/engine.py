@@ -191,8 +191,8 @@ class NativeEngine:
         """What :meth:`simulate` hands to the power flow when nobody acts.
 
         Returns:
-            Environments whose row 0 holds topology, cooldowns and injections, until the next call or simulation; None
-            if the generators cannot follow the forecast.
+            The handle of environments whose row 0 holds topology, cooldowns and injections, until the next call or
+            simulation; None if the generators cannot follow the forecast.
 
         Raises:
             UsageError: after a game over, or without such a forecast.

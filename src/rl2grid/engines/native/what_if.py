@@ -43,7 +43,6 @@ _SMALLEST_PART = 64
 _FEW = 128
 """Changes of a question whose arrays are kept for the next one of its size."""
 _DISPATCH = int(GameOver.DISPATCH)
-_NO_TOPOLOGY = "A what-if is for actions of kind NOTHING, MOVE and SWITCH; others have no topology."
 _open_snapshot, _open_changes = opener(Snapshot), opener(Changes)
 
 
@@ -179,9 +178,7 @@ class WhatIf:
         if not len(ids):
             raise UsageError("A safe action is found among some: give at least one.")
         room = self._room((len(ids), catalogue.mask.shape[1]))
-        written = _write_changes(catalogue.kind, catalogue.target, catalogue.mask, ids, room.changes.address)
-        if written < len(ids):
-            raise _refusal(catalogue, int(ids[written]))
+        _fill(room.changes, catalogue, ids)
         place = self._solvers[0].find_safe(room.changes, room.outcomes, limit, room.company)
         worst = float(room.outcomes.structure.worst_loading[place])
         return FirstSafe(place, worst, worst < limit)
@@ -378,15 +375,26 @@ def _changes_of(catalogue: ActionCatalogue, ids: Ids | None) -> Changes:
     """What actions change; of all of a catalogue, or of some.
 
     Raises:
-        UsageError: one of them changes no topology.
+        UsageError: as :func:`_fill`.
     """
-    kind, target, mask = catalogue.kind, catalogue.target, catalogue.mask
-    if ids is not None:
-        kind, target, mask = kind[ids], target[ids], mask[ids]
-    kind = _KINDS[kind]
-    if (kind < 0).any():
-        raise UsageError(_NO_TOPOLOGY)
-    return Changes(kind, target, mask)
+    asked = np.arange(len(catalogue), dtype=np.int32) if ids is None else np.asarray(ids, np.int32)
+    changes = allocate(Changes, {"change": len(asked), "word": catalogue.mask.shape[1]})
+    _fill(Handle(changes), catalogue, asked)
+    return changes
+
+
+def _fill(changes: Handle[Changes], catalogue: ActionCatalogue, ids: Ids) -> None:
+    """Write what actions change.
+
+    Raises:
+        UsageError: the catalogue lacks one of them, or one changes no topology.
+    """
+    written = _write_changes(catalogue.kind, catalogue.target, catalogue.mask, ids, changes.address)
+    if written == len(ids):
+        return
+    if 0 <= ids[written] < len(catalogue):
+        raise UsageError("A what-if is for actions of kind NOTHING, MOVE and SWITCH; others have no topology.")
+    raise UsageError(f"Action {ids[written]} is none of the catalogue: give numbers from 0 to {len(catalogue) - 1}.")
 
 
 @jit
@@ -413,7 +421,7 @@ def _write_point(environments: int, i: int, snapshot: int) -> None:
 
 @jit
 def _write_changes(kind: I8, target: I32, mask: U64, ids: I32, changes: int) -> int:
-    """Write what actions change, as :func:`_changes_of` tells.
+    """Write what actions change.
 
     Args:
         kind: of the catalogue, as the others.
@@ -435,13 +443,6 @@ def _write_changes(kind: I8, target: I32, mask: U64, ids: I32, changes: int) -> 
         for word in range(mask.shape[1]):
             asked.mask[k, word] = mask[action, word]
     return len(ids)
-
-
-def _refusal(catalogue: ActionCatalogue, action: int) -> UsageError:
-    """Why nothing can be asked about an action."""
-    if 0 <= action < len(catalogue):
-        return UsageError(_NO_TOPOLOGY)
-    return UsageError(f"Action {action} is none of the catalogue: give numbers from 0 to {len(catalogue) - 1}.")
 
 
 def legal_changes(snapshot: Snapshot, changes: Changes) -> Flags:
