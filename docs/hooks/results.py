@@ -1,7 +1,7 @@
 """Results on the pages, made from the ledger while the site is built: a figure and a short table of each task.
 
 Pages name the tasks, with ``<!-- results: bus14-T0 -->``, or with ``<!-- figure: bus14-T0 -->`` for the figure alone;
-``<!-- overview -->`` is the table of all tasks, ``<!-- learned -->`` that of methods trained with several seeds,
+``<!-- overview -->`` is the table of all tasks, ``<!-- learned -->`` that of ways of learning,
 ``<!-- untrained -->`` that of who learns nothing, ``<!-- heuristics -->`` agents by heuristic, ``<!-- bounds -->`` what
 those survive who know what comes, beside who does not.
 """

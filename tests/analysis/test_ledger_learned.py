@@ -1,4 +1,4 @@
-"""The ledger by what was learned."""
+"""The ledger by how was learned."""
 
 from __future__ import annotations
 
@@ -8,32 +8,59 @@ from sample_ledger import ledger, on, trained, untrained
 from rl2grid.analysis.ledger_learned import learned_table
 from rl2grid.errors import UsageError
 
+_BEGAN = {"started_from": {"algorithm": "imitation", "hyperparameters": {}}}
 
-def test_methods_of_several_trainings_are_compared_on_the_months_that_all_played():
-    other = "rl2grid/bus36-M-T0-v0"
+
+def _cells(table: str) -> list[list[str]]:
+    return [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines()]
+
+
+def test_ways_of_learning_are_compared_on_the_months_that_all_played():
     results = ledger(
         untrained("do-nothing", [0.1, 0.2, 0.9]),
         untrained("greedy", [0.6, 0.7, 0.9]),
         trained(1, [0.8, 0.9]),
         trained(2, [0.6, 0.9]),
         trained(1, [0.9, 0.9], algorithm="dqn"),  # a single one has no cell
-        on(other, trained(3, [0.5, 0.5])),
-        on(other, trained(1, [0.4, 0.4], algorithm="imitation")),
-        on(other, trained(2, [0.4, 0.4], algorithm="imitation")),
-        on(other, trained(4, [0.5, 0.5])),
-        on(other, trained(5, [0.9, 0.9], steps=2000)),  # more decisions than most tasks had
-        on(other, trained(6, [0.9, 0.9], steps=2000)),
+        *(on("rl2grid/bus36-M-T0-v0", trained(seed, [0.4, 0.4], algorithm="imitation")) for seed in (1, 2)),
     )
-    lines = learned_table(results).splitlines()
-    methods = "imitation, 1,000 labels | ppo, 1,000"
-    assert lines[0] == f"| task | months | do nothing | search and rules | planner | {methods} |"
-    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines[2:]]
-    assert cells[0][:6] == ["bus14-T0", "2", "0.150", "0.650", "", ""]
-    assert cells[0][6].startswith("**0.800 [")
-    assert cells[0][6].endswith("]** (2)")
-    assert cells[1][:5] == ["bus36-M-T0", "2", "", "", ""]
-    assert cells[1][5].startswith("0.400 [")
-    assert cells[1][6].startswith("**0.500 [")
+    headings, _, first, second = _cells(learned_table(results))
+    assert headings == ["task", "months", "do nothing", "search and rules", "planner", "PPO", "imitation"]
+    assert first[:5] == ["bus14-T0", "2", "0.150", "0.650", ""]
+    assert first[5].startswith("**0.800 [")
+    assert first[5].endswith("]** (2 of 1,000)")
+    assert first[6] == ""
+    assert second[:6] == ["bus36-M-T0", "2", "", "", "", ""]
+    assert second[6].startswith("**0.400 [")
+
+
+def test_of_a_way_the_longest_survival_is_shown_with_its_budget():
+    results = ledger(
+        *(trained(seed, [0.5, 0.5]) for seed in (1, 2, 3)),
+        *(trained(seed, [0.7, 0.7], steps=2000) for seed in (1, 2)),
+        *(trained(seed, [0.6, 0.6], algorithm="lagrangian-ppo") for seed in (1, 2)),
+    )
+    headings, _, row = _cells(learned_table(results))
+    assert headings[5:] == ["PPO"]
+    assert row[5].startswith("**0.700 [")
+    assert row[5].endswith("(2 of 2,000)")
+
+
+@pytest.mark.parametrize(
+    ("changes", "way"),
+    [
+        ({"algorithm": "sac"}, "SAC, TD3 or DQN"),
+        (_BEGAN, "going on from a policy"),
+        ({"top_k": 10}, "looking before acting"),
+        ({**_BEGAN, "rehearse": 24}, "looking before acting"),
+        ({"algorithm": "reinforce"}, "reinforce"),  # of one's own
+    ],
+)
+def test_ways_have_columns_of_their_own(changes, way):
+    results = ledger(*(trained(seed, [0.5]) for seed in (1, 2)), *(trained(seed, [0.6], **changes) for seed in (1, 2)))
+    headings, _, row = _cells(learned_table(results))
+    assert headings[5:] == ["PPO", way]
+    assert [cell[:8] for cell in row[5:]] == ["0.500 [0", "**0.600 "]
 
 
 def test_a_ledger_without_repeated_trainings_is_refused():

@@ -1,30 +1,35 @@
-"""The ledger of test results by what was learned: what several trainings of each method reach, task by task."""
+"""The ledger of test results by how was learned: what several trainings of each kind reach, task by task."""
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 
-from rl2grid.analysis.ledger_overview import KINDS, best_row, by_task, kind_of
+from rl2grid.analysis.ledger_overview import KINDS, best_row, by_task, kind_of, survival_of
 from rl2grid.analysis.ledger_table import LedgerRow
 from rl2grid.analysis.table import markdown_row, with_interval
 from rl2grid.envs.tasks import short_id
 from rl2grid.errors import UsageError
-from rl2grid.records.ledger import HashedTest
+from rl2grid.records.ledger import STARTED_FROM, HashedTest, looking_of
 from rl2grid.records.statistics import aggregated, estimate
-from rl2grid.records.trainings import IMITATION
 
 SEVERAL = 2
-"""Trainings that a method needs to have a cell."""
+"""Trainings that a configuration needs to have a cell."""
 BESIDE = KINDS[:-1]
 """What learned nothing, the best of each kind."""
+_ON_POLICY, _OFF_POLICY = "PPO", "SAC, TD3 or DQN"
+_OF_ALGORITHMS = {"ppo": _ON_POLICY, "lagrangian-ppo": _ON_POLICY}
+_OF_ALGORITHMS |= dict.fromkeys(("sac", "td3", "dqn"), _OFF_POLICY)
+_GOING_ON, _LOOKING = "going on from a policy", "looking before acting"
+WAYS = (_ON_POLICY, _OFF_POLICY, "imitation", _GOING_ON, _LOOKING)
+"""How policies learn, and whether they look: the columns, where there is something in them; behind them are algorithms
+that are none of the package's."""
 
 
 def learned_table(results: Mapping[str, HashedTest]) -> str:
-    """What methods of several trainings reach beside the best of what learned nothing, as Markdown, a row per task.
+    """What each way of learning reaches beside the best of what learned nothing, as Markdown, a row per task.
 
-    Of a method the rows with its commonest number of decisions are compared, of several of a task that with most
-    trainings. All values of a row are of the same months, the first that all of them played.
+    Of each way the configuration of several trainings with the highest mean survival is shown, with the number of
+    trainings and the decisions of each. All values of a row are of the same months, the first that all of them played.
 
     Args:
         results: of a ledger.
@@ -33,41 +38,33 @@ def learned_table(results: Mapping[str, HashedTest]) -> str:
         UsageError: nothing was trained twice.
     """
     rows = by_task(results)
-    learned = {task: [row for row in each if len(row.results) >= SEVERAL] for task, each in rows.items()}
-    decisions = _commonest([row for each in learned.values() for row in each])
-    if not decisions:
+    shown = {task: _of_ways([row for row in each if len(row.results) >= SEVERAL]) for task, each in rows.items()}
+    found = {way for ways in shown.values() for way in ways}
+    if not found:
         raise UsageError("No configuration of this ledger was trained with several seeds: test more of a run's seeds.")
-    names = ["task", "months", *BESIDE, *(_headed(player, number) for player, number in decisions.items())]
-    lines = [markdown_row(names), "|:--|" + "--:|" * (len(names) - 1)]
+    ways = [*(way for way in WAYS if way in found), *sorted(found - {*WAYS})]
+    lines = [markdown_row(["task", "months", *BESIDE, *ways]), "|:--|" + "--:|" * (1 + len(BESIDE) + len(ways))]
     for task, each in rows.items():
-        chosen = [_chosen(learned[task], player, number) for player, number in decisions.items()]
-        if any(row is not None for row in chosen):
+        if shown[task]:
             beside = [best_row([row for row in each if kind_of(row.first) == kind]) for kind in BESIDE]
-            lines.append(markdown_row([short_id(task), *_cells([*beside, *chosen])]))
+            lines.append(markdown_row([short_id(task), *_cells([*beside, *(shown[task].get(way) for way in ways)])]))
     return "\n".join(lines)
 
 
-def _headed(player: str, number: int) -> str:
-    """A method and what it learned from: of imitation, which plays nothing, that are labels."""
-    return f"{player}, {number:,} labels" if player.split(",")[0] == IMITATION else f"{player}, {number:,}"
+def way_of(result: HashedTest) -> str:
+    """Which of :data:`WAYS` a policy was made by; of an algorithm of none of them, its name."""
+    configuration = result.configuration
+    if looking_of(configuration):
+        return _LOOKING
+    if STARTED_FROM in configuration:
+        return _GOING_ON
+    algorithm = str(configuration["algorithm"])
+    return _OF_ALGORITHMS.get(algorithm, algorithm)
 
 
-def _commonest(rows: Sequence[LedgerRow]) -> dict[str, int]:
-    """Of each method, the decisions with which it was trained for most tasks; of as many, the fewest."""
-    tasks: dict[str, Counter[int]] = {}
-    for player, number, _ in {(row.first.player, _decisions(row), row.first.task) for row in rows}:
-        tasks.setdefault(player, Counter())[number] += 1
-    found = {player: min(counts, key=lambda one: (-counts[one], one)) for player, counts in tasks.items()}
-    return dict(sorted(found.items()))
-
-
-def _decisions(row: LedgerRow) -> int:
-    return int(row.first.configuration["hyperparameters"]["total_timesteps"])
-
-
-def _chosen(rows: Sequence[LedgerRow], player: str, decisions: int) -> LedgerRow | None:
-    able = [row for row in rows if row.first.player == player and _decisions(row) == decisions]
-    return max(able, key=lambda row: len(row.results), default=None)
+def _of_ways(rows: Sequence[LedgerRow]) -> dict[str, LedgerRow]:
+    """The row of each way with the highest mean survival."""
+    return {way_of(row.first): row for row in sorted(rows, key=survival_of)}
 
 
 def _cells(rows: Sequence[LedgerRow | None]) -> list[str]:
@@ -85,4 +82,5 @@ def _cell(row: LedgerRow, months: int, highest: float) -> str:
         survival = f"{aggregated(scores):.3f}"
         return f"**{survival}**" if is_highest else survival
     survival = with_interval(estimate(scores), 3)
-    return f"{f'**{survival}**' if is_highest else survival} ({len(row.results)})"
+    decisions = int(row.first.configuration["hyperparameters"]["total_timesteps"])
+    return f"{f'**{survival}**' if is_highest else survival} ({len(row.results)} of {decisions:,})"

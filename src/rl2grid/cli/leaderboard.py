@@ -82,7 +82,7 @@ def _add_table(actions: Any) -> None:
         "--best", action="store_true", help="of a ledger: the best of each kind of agent, a row per task"
     )
     parser.add_argument(
-        "--learned", action="store_true", help="of a ledger: methods trained with several seeds, a row per task"
+        "--learned", action="store_true", help="of a ledger: ways of learning side by side, a row per task"
     )
     parser.add_argument(
         "--untrained", action="store_true", help="of a ledger: doing nothing, search and plans, a row per task"
