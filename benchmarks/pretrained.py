@@ -2,10 +2,10 @@
 
 ``python benchmarks/pretrained.py RUN NAME --made-by COMMAND ... --limits TEXT [--beside AGENT ...] [--months N]
 [--skip N] [--top-k K] [--rehearse STEPS]`` plays the policy, the policy that looks before it acts in each of the ways
-that are asked for, and the agents beside it on N validation months after the first ``--skip``, by which the training
-picked its best policy, and writes ``src/rl2grid/algorithms/policies/NAME.pt`` and ``NAME.json``. ``rl2grid pretrained``
-shows them. Of what would be larger than a policy of the package may be, the critic is kept in half precision: nobody
-acts by it, and who goes on from the policy fits it anew.
+that are asked for and in both, and the agents beside it on N validation months after the first ``--skip``, by which
+the training picked its best policy, and writes ``src/rl2grid/algorithms/policies/NAME.pt`` and ``NAME.json``.
+``rl2grid pretrained`` shows them. Of what would be larger than a policy of the package may be, the critic is kept in
+half precision: nobody acts by it, and who goes on from the policy fits it anew.
 """
 
 from __future__ import annotations
@@ -70,8 +70,12 @@ def main() -> None:
     months = validation_months(task, options.skip, options.months)
     policy = PolicyAgent(contents, name=f"pretrained-{options.name}")
     agents: list[Agent] = [policy]
-    for way, value in looking(options).items():
-        agents.append(looking_policy(PolicyAgent(contents, name=policy.name), **{way: value}))
+    asked = looking(options)
+    ways = [{way: value} for way, value in asked.items()]
+    agents += [
+        looking_policy(PolicyAgent(contents, name=policy.name), **way)
+        for way in ([*ways, asked] if len(ways) > 1 else ways)
+    ]
     agents += [make_agent(name, task) for name in options.beside]
     card = ModelCard(
         name=options.name,

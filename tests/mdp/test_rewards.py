@@ -11,6 +11,7 @@ from rl2grid.engines.probes import make_probe
 from rl2grid.engines.reference.engine import ReferenceEngine
 from rl2grid.errors import UsageError
 from rl2grid.grids import GRID_IDS, load_grid
+from rl2grid.mdp.actions import DO_NOTHING
 from rl2grid.mdp.rewards import (
     PRESETS,
     default_components,
@@ -202,6 +203,19 @@ def test_the_printed_cost_saturates(calm):
     dear = grid.gen_cost_per_mw == grid.gen_cost_per_mw.max()
     assert cost_of(paper_components, state, gen_p=10.0 * dear, load_p=[0]) == -1
     assert cost_of(paper_components, state, gen_p=10.0 * dear, load_p=[500]) == 0
+
+
+@pytest.mark.parametrize("grid_id", GRID_IDS)
+def test_of_the_printed_reward_the_first_half_of_a_month_is_worth_less_than_its_end(grid_id):
+    """Its cost is saturated, so that a step is worth t / T - 1/2 at most, and a game over 0."""
+    grid = load_grid(grid_id)
+    engine = NativeEngine(grid, 1)
+    reward, steps = resolve_reward("paper"), 60
+    engine.reset(0, EpisodePlan(1, 0, list_scenarios(grid.id, "bundled")[0], 0, 2 * steps))
+    for _ in range(steps - 1):
+        engine.step(0, DO_NOTHING)
+        assert not engine.state.terminated[0]
+        assert np.dot(reward.weights, reward.components(engine.state, 0)) < 0
 
 
 def test_an_illegal_or_ambiguous_action_is_fined_by_the_released_reward_only(calm):

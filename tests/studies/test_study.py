@@ -160,9 +160,9 @@ def test_included_studies_are_valid_at_every_scale(name: str):
     assert list(file["scale"]) == ["quick", "full"]
 
 
-def test_the_paper_at_full_scale_has_its_reward_hyperparameters_and_budget():
+def test_the_paper_at_full_scale_has_the_reward_of_its_code_its_hyperparameters_and_budget():
     cells = parse_study(read_toml(included_studies()["paper"]), "full").cells
-    assert all(cell.environment["reward"] == "paper" for cell in cells)
+    assert all(cell.environment["reward"] == "released" for cell in cells)
     trained = [cell for cell in cells if cell.training is not None]
     assert all(cell.training.preset == "paper" and cell.decisions == 80_000_000 for cell in trained)
 

@@ -11,16 +11,22 @@ from rl2grid.envs.tasks import short_id
 from rl2grid.errors import UsageError
 from rl2grid.records.ledger import STARTED_FROM, HashedTest, looking_of
 from rl2grid.records.statistics import aggregated, estimate
+from rl2grid.records.trainings import IMITATION
 
 SEVERAL = 2
 """Trainings that a configuration needs to have a cell."""
 BESIDE = KINDS[:-1]
 """What learned nothing, the best of each kind."""
 _ON_POLICY, _OFF_POLICY = "PPO", "SAC, TD3 or DQN"
-_OF_ALGORITHMS = {"ppo": _ON_POLICY, "lagrangian-ppo": _ON_POLICY}
-_OF_ALGORITHMS |= dict.fromkeys(("sac", "td3", "dqn"), _OFF_POLICY)
+_OF_ALGORITHMS = {
+    "ppo": _ON_POLICY,
+    "lagrangian-ppo": _ON_POLICY,
+    "sac": _OFF_POLICY,
+    "td3": _OFF_POLICY,
+    "dqn": _OFF_POLICY,
+}
 _GOING_ON, _LOOKING = "going on from a policy", "looking before acting"
-WAYS = (_ON_POLICY, _OFF_POLICY, "imitation", _GOING_ON, _LOOKING)
+WAYS = (_ON_POLICY, _OFF_POLICY, IMITATION, _GOING_ON, _LOOKING)
 """How policies learn, and whether they look: the columns, where there is something in them; behind them are algorithms
 that are none of the package's."""
 
