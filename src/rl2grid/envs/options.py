@@ -69,8 +69,9 @@ class TaskOptions:
         default="default",
         metadata={"flag": "default, paper, released or trips, or the weights of the three components, such as 1,0.5,0"},
     )
-    """A preset (``"default"``, ``"paper"``, ``"released"``, ``"trips"``), the weights of the three default components,
-    or a function ``(state, i) -> (survive, overload, cost)``, compiled by Numba or plain Python."""
+    """A preset (``"default"``, ``"trips"``, ``"released"``, or ``"paper"``, by which it pays to lose the grid early),
+    the weights of the three default components, or a function ``(state, i) -> (survive, overload, cost)``, compiled by
+    Numba or plain Python."""
     split: str = field(default="train", metadata=_one_of(*SPLITS))
     """Which scenarios are played: ``"train"`` (months without end), ``"validation"`` (200 months), ``"test"`` (500), or
     ``"bundled"``, the series inside the Grid2Op wheel."""

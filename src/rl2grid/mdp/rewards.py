@@ -16,7 +16,8 @@ formula has the sign of an overload the wrong way round and names no normalisers
 
 ``paper`` (weights 1, 0.5, 0.5: its appendix) is the printed formula, the excess counted negative and
 every term clipped to the range that the paper states. As sums over the grid and costs in MW are far
-larger than those ranges, both terms are saturated most of the time:
+larger than those ranges, both terms are saturated most of the time. A step is worth t / T - 1/2 at most then: in the
+first half of a month less than a game over, which learners bring about:
 
 - survive = t / T
 - overload = clip(-sum over L of (max(rho - 1, 0) if connected else 1), -1, 1)
