@@ -1,4 +1,4 @@
-"""The ledger by how was learned."""
+"""The ledger by ways of learning."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The ledger of test results by how was learned: what several trainings of each kind reach, task by task."""
+"""The ledger of test results by ways of learning: what several trainings reach by each, task by task."""
 
 from __future__ import annotations
 
