@@ -72,10 +72,9 @@ def main() -> None:
     agents: list[Agent] = [policy]
     asked = looking(options)
     ways = [{way: value} for way, value in asked.items()]
-    agents += [
-        looking_policy(PolicyAgent(contents, name=policy.name), **way)
-        for way in ([*ways, asked] if len(ways) > 1 else ways)
-    ]
+    if len(ways) > 1:
+        ways.append(asked)
+    agents += [looking_policy(PolicyAgent(contents, name=policy.name), **way) for way in ways]
     agents += [make_agent(name, task) for name in options.beside]
     card = ModelCard(
         name=options.name,

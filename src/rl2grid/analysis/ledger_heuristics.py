@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from rl2grid.analysis.ledger_overview import by_task, survival_of
 from rl2grid.analysis.ledger_table import LedgerRow
 from rl2grid.analysis.result_tables import HEURISTIC_LETTERS
-from rl2grid.analysis.table import markdown_row, with_interval
+from rl2grid.analysis.table import highlighted, markdown_row, with_interval
 from rl2grid.envs.tasks import short_id
 from rl2grid.records.ledger import HashedTest
 from rl2grid.records.statistics import estimate
@@ -47,6 +47,5 @@ def _heuristic(row: LedgerRow) -> str:
 def _cell(row: LedgerRow | None, highest: float) -> str:
     if row is None:
         return ""
-    survival = with_interval(estimate(row.scores("survival")), 3)
-    shown = f"**{survival}**" if survival_of(row) == highest else survival
+    shown = highlighted(with_interval(estimate(row.scores("survival")), 3), survival_of(row) == highest)
     return f"{shown} ({len(row.results)})" if row.first.training else shown

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from rl2grid.analysis.ledger_overview import KINDS, best_row, by_task, kind_of, survival_of
 from rl2grid.analysis.ledger_table import LedgerRow
-from rl2grid.analysis.table import markdown_row, with_interval
+from rl2grid.analysis.table import highlighted, markdown_row, with_interval
 from rl2grid.envs.tasks import short_id
 from rl2grid.errors import UsageError
 from rl2grid.records.ledger import STARTED_FROM, HashedTest, looking_of
@@ -57,7 +57,7 @@ def learned_table(results: Mapping[str, HashedTest]) -> str:
     return "\n".join(lines)
 
 
-def way_of(result: HashedTest) -> str:
+def _way_of(result: HashedTest) -> str:
     """Which of :data:`WAYS` a policy was made by; of an algorithm of none of them, its name."""
     configuration = result.configuration
     if looking_of(configuration):
@@ -70,7 +70,7 @@ def way_of(result: HashedTest) -> str:
 
 def _of_ways(rows: Sequence[LedgerRow]) -> dict[str, LedgerRow]:
     """The row of each way with the highest mean survival."""
-    return {way_of(row.first): row for row in sorted(rows, key=survival_of)}
+    return {_way_of(row.first): row for row in sorted(rows, key=survival_of)}
 
 
 def _cells(rows: Sequence[LedgerRow | None]) -> list[str]:
@@ -85,8 +85,7 @@ def _cell(row: LedgerRow, months: int, highest: float) -> str:
     scores = row.scores("survival", months)
     is_highest = aggregated(scores) == highest
     if not row.first.training:
-        survival = f"{aggregated(scores):.3f}"
-        return f"**{survival}**" if is_highest else survival
-    survival = with_interval(estimate(scores), 3)
+        return highlighted(f"{aggregated(scores):.3f}", is_highest)
+    survival = highlighted(with_interval(estimate(scores), 3), is_highest)
     decisions = int(row.first.configuration["hyperparameters"]["total_timesteps"])
-    return f"{f'**{survival}**' if is_highest else survival} ({len(row.results)} of {decisions:,})"
+    return f"{survival} ({len(row.results)} of {decisions:,})"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from rl2grid.analysis.ledger_table import LedgerRow, ledger_rows
-from rl2grid.analysis.table import markdown_row
+from rl2grid.analysis.table import highlighted, markdown_row
 from rl2grid.envs.tasks import all_tasks, short_id
 from rl2grid.records.ledger import HashedTest
 from rl2grid.records.looks import by_present_rules
@@ -72,8 +72,7 @@ def _cell(row: LedgerRow | None, highest: float) -> str:
 
 def survival_cell(row: LedgerRow, highest: float, label: str, remarks: Sequence[str]) -> str:
     """Mean survival, bold if it is the highest of its line, who it is, and remarks in brackets."""
-    survival = f"{survival_of(row):.3f}"
-    shown = f"**{survival}**" if survival_of(row) == highest else survival
+    shown = highlighted(f"{survival_of(row):.3f}", survival_of(row) == highest)
     return " ".join([shown, *([label] if label else []), *([f"({', '.join(remarks)})"] if remarks else [])])
 
 

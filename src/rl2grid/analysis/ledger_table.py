@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from rl2grid.analysis.result_tables import merits
-from rl2grid.analysis.table import difference_cell, markdown_row, p_cell, share_text, with_interval
+from rl2grid.analysis.table import difference_cell, highlighted, markdown_row, p_cell, share_text, with_interval
 from rl2grid.envs.tasks import find_task, short_id
 from rl2grid.errors import one_of
 from rl2grid.mdp.constraint_table import CONSTRAINTS, THRESHOLDS
@@ -142,8 +142,8 @@ def short_ledger_table(results: Mapping[str, HashedTest], task: str) -> str:
         survival = with_interval(estimate(row.scores("survival")), 3)
         difference = compared.get(number)
         cells = (
-            f"**{row.label}**" if place == 0 else row.label,
-            f"**{survival}**" if place == 0 else survival,
+            highlighted(row.label, place == 0),
+            highlighted(survival, place == 0),
             difference_cell(difference).text if isinstance(difference, Difference) else difference or "",
             share_text(estimate(row.scores("completed"))),
             "" if limit is None else f"{estimate(row.scores(CONSTRAINTS[limit].column)).value:,.1f}",

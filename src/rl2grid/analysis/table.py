@@ -174,7 +174,7 @@ def table_markdown(table: ResultTable) -> str:
     headings = [_heading(column) for column in table.columns]
     lines = [markdown_row(headings), markdown_row([":--" if column.words else "--:" for column in table.columns])]
     for row in table.rows:
-        lines.append(markdown_row([f"**{cell.text}**" if cell.best else cell.text for cell in row]))
+        lines.append(markdown_row([highlighted(cell.text, cell.best) for cell in row]))
     return "\n".join(lines) + f"\n\n{table.caption}\n"
 
 
@@ -221,6 +221,11 @@ def with_interval(estimate: Estimate, digits: int) -> str:
     if math.isnan(estimate.low):
         return f"{estimate.value:.{digits}f}"
     return f"{estimate.value:.{digits}f} [{estimate.low:.{digits}f}, {estimate.high:.{digits}f}]"
+
+
+def highlighted(text: str, is_best: bool) -> str:
+    """A cell of Markdown, bold if it is the best."""
+    return f"**{text}**" if is_best else text
 
 
 def markdown_row(cells: Sequence[str]) -> str:
