@@ -1,10 +1,10 @@
-"""PPO's discount, learning rates, size and updates on larger grids: each changed alone, and what was best together.
+"""PPO's discount, learning rates, size and updates on larger grids, each changed alone.
 
-``python benchmarks/families.py search FAMILY --folder F`` trains PPO's preset ``default`` and variants of it on a task
+``python benchmarks/families.py FAMILY --folder F`` trains PPO's preset ``default`` and variants of it on a task
 of the family, with two seeds, each on 100,000 decisions, keeps the policy that survives longest on the first 20
 validation months and plays it on the 60 behind these. It goes on after an interruption, writes
-``benchmarks/results/families.json`` and prints what is best of each kind, where it is better than the default. ``--only
-NAME`` trains one variant, for several processes side by side. Test months are never played.
+``benchmarks/results/families.json`` and prints what it wrote. ``--only NAME`` trains one variant, for several processes
+side by side. Test months are never played.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,33 +20,24 @@ from typing import Any
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
 import numpy as np
-from gains import CHOSEN_ON, survival_behind
+from gains import CHOSEN_ON, go_on, survival_behind
 
 import rl2grid
 from rl2grid.records.files import write_json
-from rl2grid.training.request import read_config
-from rl2grid.training.runs import resume
-from rl2grid.training.validation import find_validator
 
 RESULTS = Path(__file__).resolve().parent / "results" / "families.json"
 BUDGET, VALIDATIONS, SEEDS, MONTHS = 100_000, 5, (1, 2), 60
-KINDS: dict[str, dict[str, dict[str, Any]]] = {
-    "discount": {"gamma 0.95": {"gamma": 0.95}, "gamma 0.99": {"gamma": 0.99}},
-    "rates": {
-        "rates 0.0003": {"actor_learning_rate": 3e-4, "critic_learning_rate": 3e-4},
-        "rates 0.003": {"actor_learning_rate": 3e-3, "critic_learning_rate": 3e-3},
-    },
-    "size": {
-        "layers of 64": {"actor_layers": [64, 64], "critic_layers": [64, 64]},
-        "layers of 256": {"actor_layers": [256, 256], "critic_layers": [256, 256]},
-    },
-    "updates": {"updates of 2,048": {"num_envs": 64, "num_steps": 32, "num_minibatches": 8}},
-}
-"""By kind, the variants of the preset ``default`` and what they change."""
 VARIANTS: dict[str, dict[str, Any]] = {
     "default": {},
-    **{name: changes for variants in KINDS.values() for name, changes in variants.items()},
+    "gamma 0.95": {"gamma": 0.95},
+    "gamma 0.99": {"gamma": 0.99},
+    "rates 0.0003": {"actor_learning_rate": 3e-4, "critic_learning_rate": 3e-4},
+    "rates 0.003": {"actor_learning_rate": 3e-3, "critic_learning_rate": 3e-3},
+    "layers of 64": {"actor_layers": [64, 64], "critic_layers": [64, 64]},
+    "layers of 256": {"actor_layers": [256, 256], "critic_layers": [256, 256]},
+    "updates of 2,048": {"num_envs": 64, "num_steps": 32, "num_minibatches": 8},
 }
+"""What each changes of the preset ``default``."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +60,7 @@ def played(family: Family, name: str, seed: int, folder: Path) -> list[float]:
         survival: list[float] = json.loads(kept.read_text())
         return survival
     if (run / "config.json").exists():
-        resume(run, evaluate=find_validator(read_config(run)[0]))
+        go_on(run)
     else:
         rl2grid.train(
             "ppo",
@@ -87,20 +78,9 @@ def played(family: Family, name: str, seed: int, folder: Path) -> list[float]:
     return survival
 
 
-def best_of_each_kind(means: Mapping[str, float]) -> dict[str, Any]:
-    """Changes by what is best of each kind, where it is better than the default."""
-    changes: dict[str, Any] = {}
-    for variants in KINDS.values():
-        best = max(variants, key=lambda name: means[name])
-        if means[best] > means["default"]:
-            changes |= variants[best]
-    return changes
-
-
 def main() -> None:
     """Train what is asked for and not there yet."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("search",))
     parser.add_argument("family", choices=tuple(FAMILIES))
     parser.add_argument("--only", choices=tuple(VARIANTS), help="train this variant and write nothing else")
     parser.add_argument("--folder", type=Path, default=Path("families"), help="where trainings are kept")
@@ -110,14 +90,12 @@ def main() -> None:
     survival = {name: [played(family, name, seed, arguments.folder) for seed in SEEDS] for name in names}
     if arguments.only:
         return
-    means = {name: round(float(np.mean(runs)), 4) for name, runs in survival.items()}
     results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
     results[arguments.family] = {
         "task": family.task,
         "heuristic": family.heuristic,
-        "survival": means,
+        "survival": {name: round(float(np.mean(runs)), 4) for name, runs in survival.items()},
         "trainings": {name: [round(float(np.mean(run)), 4) for run in runs] for name, runs in survival.items()},
-        "found": best_of_each_kind(means),
     }
     write_json(RESULTS, results, indent=1)
     print(json.dumps(results[arguments.family], indent=1))

@@ -20,6 +20,9 @@ from rl2grid.records.comparisons import paired_differences
 from rl2grid.records.statistics import UNIT, Estimate, Scores, estimate
 from rl2grid.scenarios.library import list_scenarios
 from rl2grid.scenarios.splits import VALIDATION
+from rl2grid.training.request import read_config
+from rl2grid.training.runs import resume
+from rl2grid.training.validation import find_validator
 
 CHOSEN_ON = 20
 """Validation months by which the best policy of a training is kept."""
@@ -28,6 +31,11 @@ CHOSEN_ON = 20
 def validation_months(task: Task, skip: int, months: int) -> tuple[str, ...]:
     """The ``months`` validation months behind the first ``skip``."""
     return first_months(task, VALIDATION, skip + months)[skip:]
+
+
+def go_on(run: Path) -> None:
+    """Train an interrupted run to its end, validated as it was begun."""
+    resume(run, evaluate=find_validator(read_config(run)[0]))
 
 
 def survival_behind(agent: Agent | Path, task_id: str, months: int | None = None) -> list[float]:

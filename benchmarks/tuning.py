@@ -20,15 +20,14 @@ from typing import Any
 
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
-from gains import CHOSEN_ON, compared, survival_behind
+from gains import CHOSEN_ON, compared, go_on, survival_behind
 from rich.console import Console
 
 from rl2grid.records.files import write_json
 from rl2grid.records.searches import JOURNAL_FILE
 from rl2grid.studies.search import run_tuning
 from rl2grid.studies.tuning import WEIGHT_CHOICES, Tuning, parse_tuning, run_args
-from rl2grid.training.request import read_config
-from rl2grid.training.runs import resume, train
+from rl2grid.training.runs import train
 from rl2grid.training.validation import find_validator
 
 RESULTS = Path(__file__).resolve().parent / "results" / "tuning.json"
@@ -159,7 +158,7 @@ def survival(name: str, variant: str, changes: Mapping[str, Any], seed: int, fol
     """Train, or go on, and play the best policy: survival of each of the months that no trial was chosen by."""
     run = folder / f"{name}-{variant}-{seed}"
     if run.exists():
-        resume(run, evaluate=find_validator(read_config(run)[0]))
+        go_on(run)
     else:
         args = run_args(_tuning(name, {}, folder), changes, run, seed)
         train(args, evaluate=find_validator(args))
