@@ -84,6 +84,9 @@ def test_a_training_is_a_run_that_comes_back_and_is_evaluated(tmp_path: Path):
         rl2grid.train("qpo", "bus14-T0")
     with pytest.raises(UsageError, match="sizes"):
         rl2grid.train("ppo", "bus14-T0", hyperparameters={"sizes": 3})
+    with pytest.raises(UsageError, match="num_threads=0"):
+        rl2grid.train("ppo", "bus14-T0", folder=tmp_path / "none", num_threads=0, progress=False)
+    assert not (tmp_path / "none").exists()
 
 
 def test_a_training_begins_where_it_is_told_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

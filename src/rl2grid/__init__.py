@@ -82,6 +82,7 @@ def train(
     hyperparameters: Mapping[str, Any] | None = None,
     validation_months: int | None = 20,
     evaluate_every: int = 50_000,
+    num_threads: int | None = None,
     progress: bool = True,
     **options: Any,
 ) -> Path:
@@ -98,6 +99,8 @@ def train(
         hyperparameters: Of the algorithm, such as ``{"total_timesteps": 100_000, "seed": 1}`` (decisions to train for).
         validation_months: How many validation months pick the best policy; None: all, 0: none.
         evaluate_every: Decisions between two validations; there is one more at the end.
+        num_threads: Native engine: threads that play the environments; None: one per processor core. Results do not
+            depend on it.
         progress: Whether to show a progress bar.
         options: Keywords of ``gymnasium.make``, such as ``heuristic`` or ``reward``.
 
@@ -121,6 +124,7 @@ def train(
         env_keywords=options,
         evaluate_every=evaluate_every,
         validation_months=validation_months,
+        num_threads=num_threads,
         progress=progress,
     )
     return runs.train(args, evaluate=find_validator(args))
