@@ -3,8 +3,8 @@
 ``python benchmarks/families.py search FAMILY --folder F`` trains PPO's preset ``default`` and variants of it on a task
 of the family, with two seeds, each on 100,000 decisions, keeps the policy that survives longest on the first 20
 validation months and plays it on the 60 behind these. ``... compare FAMILY --folder F`` trains the default, the two
-variants that were best and both changes at once on tasks of two grids, with seeds that the search did not use, and
-plays them on the 120 validation months that it did not play. Both go on after an interruption, write
+variants that were best on 36 substations and both changes at once with seeds that the search did not use, and plays
+them on the 120 validation months that it did not play. Both go on after an interruption, write
 ``benchmarks/results/families.json`` and print what they wrote. ``--only NAME`` trains one variant and
 writes nothing, for several processes side by side. Test months are never played.
 """
@@ -63,27 +63,16 @@ class Family:
     task: str
     heuristic: str
     """By which greedy search survives longest."""
-    others: Mapping[str, str]
-    """Tasks of other grids of the family on which finalists are compared as well, with the heuristic of each."""
-
-    @property
-    def compared(self) -> dict[str, str]:
-        """Tasks on which finalists are compared, with the heuristic of each."""
-        return {self.task: self.heuristic, **self.others}
 
 
-FAMILIES = {
-    "36": Family("bus36-M-T0", "careful", {"bus36-MO-v1-T0": "idle"}),
-    "118": Family("bus118-M-T0", "careful", {"bus118-MOB-v1-T0": "idle"}),
-}
+FAMILIES = {"36": Family("bus36-M-T0", "careful"), "118": Family("bus118-M-T0", "careful")}
 
 
 @dataclass(frozen=True)
 class Training:
     """One training and the months that its best policy plays."""
 
-    task: str
-    heuristic: str
+    family: Family
     name: str
     changes: Mapping[str, Any]
     seed: int
@@ -91,7 +80,7 @@ class Training:
 
     def survival(self, folder: Path) -> list[float]:
         """Train, or go on, and play the best policy: survival of the months; kept in the folder."""
-        label = f"{self.task}-{self.name.replace(',', '').replace(' ', '-')}-{self.seed}"
+        label = f"{self.family.task}-{self.name.replace(',', '').replace(' ', '-')}-{self.seed}"
         run, kept = folder / label, folder / f"{label}.json"
         if kept.exists():
             survival: list[float] = json.loads(kept.read_text())
@@ -100,28 +89,28 @@ class Training:
             go_on(run)
         else:
             self._begin(run)
-        survival = survival_behind(run, self.task, self.months.stop)[self.months]
+        survival = survival_behind(run, self.family.task, self.months.stop)[self.months]
         write_json(kept, survival)
-        print(self.task, self.name, self.seed, round(float(np.mean(survival)), 3), flush=True)
+        print(self.family.task, self.name, self.seed, round(float(np.mean(survival)), 3), flush=True)
         return survival
 
     def _begin(self, run: Path) -> None:
         rl2grid.train(
             "ppo",
-            self.task,
+            self.family.task,
             folder=run,
             hyperparameters={**self.changes, "total_timesteps": BUDGET, "seed": self.seed, "torch_threads": 1},
             validation_months=CHOSEN_ON,
             evaluate_every=BUDGET // VALIDATIONS,
             progress=False,
-            heuristic=self.heuristic,
+            heuristic=self.family.heuristic,
         )
 
 
 def searched(family: Family) -> dict[str, list[Training]]:
     """The trainings of a search by variant."""
     return {
-        name: [Training(family.task, family.heuristic, name, changes, seed, SEARCHED) for seed in SEARCH_SEEDS]
+        name: [Training(family, name, changes, seed, SEARCHED) for seed in SEARCH_SEEDS]
         for name, changes in VARIANTS.items()
     }
 
@@ -138,28 +127,17 @@ def search(family: Family, folder: Path) -> dict[str, Any]:
 
 
 def finalists(family: Family) -> dict[str, list[Training]]:
-    """The trainings that are compared by variant: of every seed those on all tasks."""
+    """The trainings that are compared by variant."""
     return {
-        name: [
-            Training(task, heuristic, name, changes, seed, NOT_SEARCHED)
-            for seed in COMPARED_SEEDS
-            for task, heuristic in family.compared.items()
-        ]
+        name: [Training(family, name, changes, seed, NOT_SEARCHED) for seed in COMPARED_SEEDS]
         for name, changes in FINALISTS.items()
     }
 
 
 def compare(family: Family, folder: Path) -> dict[str, Any]:
-    """The finalists on all tasks: of each task, means of trainings and gains over the default."""
-    trainings = finalists(family)
-    survival = {
-        task: {name: [one.survival(folder) for one in trainings[name] if one.task == task] for name in trainings}
-        for task in family.compared
-    }
-    return {
-        task: {"heuristic": family.compared[task], "compared": compared(played, "default"), "trainings": _means(played)}
-        for task, played in survival.items()
-    }
+    """The finalists: survival and gain over the default, and the mean of every training."""
+    survival = {name: [one.survival(folder) for one in trainings] for name, trainings in finalists(family).items()}
+    return {"compared": compared(survival, "default"), "trainings": _means(survival)}
 
 
 def _means(survival: Mapping[str, Sequence[Sequence[float]]]) -> dict[str, list[float]]:
