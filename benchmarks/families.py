@@ -14,8 +14,8 @@ from __future__ import annotations
 import argparse
 import json
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,11 +29,8 @@ from rl2grid.records.files import write_json
 
 RESULTS = Path(__file__).resolve().parent / "results" / "families.json"
 BUDGET, VALIDATIONS = 100_000, 5
-SEARCHED = slice(0, 60)
-"""Of the months behind those that chose a policy, the ones that the search played."""
-NOT_SEARCHED = slice(60, None)
-"""And the ones that compare what it found."""
-SEARCH_SEEDS, COMPARED_SEEDS = (1, 2), (11, 12, 13)
+SEARCHED = 60
+"""How many of the months behind those that chose a policy are played by a search; others compare what it found."""
 _SLOWER: dict[str, Any] = {"actor_learning_rate": 3e-4, "critic_learning_rate": 3e-4}
 _LARGER: dict[str, Any] = {"num_envs": 64, "num_steps": 32, "num_minibatches": 8}
 VARIANTS: dict[str, dict[str, Any]] = {
@@ -69,18 +66,19 @@ FAMILIES = {"36": Family("bus36-M-T0", "careful"), "118": Family("bus118-M-T0", 
 
 
 @dataclass(frozen=True)
-class Training:
-    """One training and the months that its best policy plays."""
+class Stage:
+    """A search, or what compares its finds: what is trained, and the months that are played."""
 
-    family: Family
-    name: str
-    changes: Mapping[str, Any]
-    seed: int
-    months: slice
+    variants: Mapping[str, Mapping[str, Any]]
+    seeds: tuple[int, ...]
+    skip: int
+    """Months behind those that choose a policy which are not played."""
+    months: int | None
+    """How many are played then; None: all."""
 
-    def survival(self, folder: Path) -> list[float]:
-        """Train, or go on, and play the best policy: survival of the months; kept in the folder."""
-        label = f"{self.family.task}-{self.name.replace(',', '').replace(' ', '-')}-{self.seed}"
+    def survival(self, family: Family, name: str, seed: int, folder: Path) -> list[float]:
+        """Train a variant, or go on, and play the best policy: survival of the months; kept in the folder."""
+        label = f"{family.task}-{name.replace(',', '').replace(' ', '-')}-{seed}"
         run, kept = folder / label, folder / f"{label}.json"
         if kept.exists():
             survival: list[float] = json.loads(kept.read_text())
@@ -88,81 +86,54 @@ class Training:
         if (run / "config.json").exists():
             go_on(run)
         else:
-            self._begin(run)
-        survival = survival_behind(run, self.family.task, self.months.stop)[self.months]
+            begin(run, family, {**self.variants[name], "seed": seed})
+        survival = survival_behind(run, family.task, self.months, skip=self.skip)
         write_json(kept, survival)
-        print(self.family.task, self.name, self.seed, round(float(np.mean(survival)), 3), flush=True)
+        print(family.task, name, seed, round(float(np.mean(survival)), 3), flush=True)
         return survival
 
-    def _begin(self, run: Path) -> None:
-        rl2grid.train(
-            "ppo",
-            self.family.task,
-            folder=run,
-            hyperparameters={**self.changes, "total_timesteps": BUDGET, "seed": self.seed, "torch_threads": 1},
-            validation_months=CHOSEN_ON,
-            evaluate_every=BUDGET // VALIDATIONS,
-            progress=False,
-            heuristic=self.family.heuristic,
-        )
+
+STAGES = {"search": Stage(VARIANTS, (1, 2), 0, SEARCHED), "compare": Stage(FINALISTS, (11, 12, 13), SEARCHED, None)}
 
 
-def searched(family: Family) -> dict[str, list[Training]]:
-    """The trainings of a search by variant."""
-    return {
-        name: [Training(family, name, changes, seed, SEARCHED) for seed in SEARCH_SEEDS]
-        for name, changes in VARIANTS.items()
-    }
-
-
-def search(family: Family, folder: Path) -> dict[str, Any]:
-    """Every variant on the family's task: mean survival, of all trainings and of each."""
-    survival = {name: [one.survival(folder) for one in trainings] for name, trainings in searched(family).items()}
-    return {
-        "task": family.task,
-        "heuristic": family.heuristic,
-        "survival": {name: round(float(np.mean(runs)), 4) for name, runs in survival.items()},
-        "trainings": _means(survival),
-    }
-
-
-def finalists(family: Family) -> dict[str, list[Training]]:
-    """The trainings that are compared by variant."""
-    return {
-        name: [Training(family, name, changes, seed, NOT_SEARCHED) for seed in COMPARED_SEEDS]
-        for name, changes in FINALISTS.items()
-    }
-
-
-def compare(family: Family, folder: Path) -> dict[str, Any]:
-    """The finalists: survival and gain over the default, and the mean of every training."""
-    survival = {name: [one.survival(folder) for one in trainings] for name, trainings in finalists(family).items()}
-    return {"compared": compared(survival, "default"), "trainings": _means(survival)}
-
-
-def _means(survival: Mapping[str, Sequence[Sequence[float]]]) -> dict[str, list[float]]:
-    return {name: [round(float(np.mean(run)), 4) for run in runs] for name, runs in survival.items()}
+def begin(run: Path, family: Family, hyperparameters: Mapping[str, Any]) -> None:
+    """Train from the beginning."""
+    rl2grid.train(
+        "ppo",
+        family.task,
+        folder=run,
+        hyperparameters={**hyperparameters, "total_timesteps": BUDGET, "torch_threads": 1},
+        validation_months=CHOSEN_ON,
+        evaluate_every=BUDGET // VALIDATIONS,
+        progress=False,
+        heuristic=family.heuristic,
+    )
 
 
 def main() -> None:
     """Train what is asked for and not there yet."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("search", "compare"))
+    parser.add_argument("what", choices=tuple(STAGES))
     parser.add_argument("family", choices=tuple(FAMILIES))
     parser.add_argument("--only", metavar="NAME", help="train this variant and write nothing else")
     parser.add_argument("--folder", type=Path, default=Path("families"), help="where trainings are kept")
     arguments = parser.parse_args()
-    family = FAMILIES[arguments.family]
+    family, stage = FAMILIES[arguments.family], STAGES[arguments.what]
+    if arguments.only and arguments.only not in stage.variants:
+        parser.error(f"To {arguments.what}, train one of {', '.join(map(repr, stage.variants))}.")
+    survival = {
+        name: [stage.survival(family, name, seed, arguments.folder) for seed in stage.seeds]
+        for name in ([arguments.only] if arguments.only else stage.variants)
+    }
     if arguments.only:
-        trainings = (searched if arguments.what == "search" else finalists)(family)
-        if arguments.only not in trainings:
-            parser.error(f"To {arguments.what}, train one of {', '.join(map(repr, trainings))}.")
-        for training in trainings[arguments.only]:
-            training.survival(arguments.folder)
         return
-    found = (search if arguments.what == "search" else compare)(family, arguments.folder)
+    found: dict[str, Any] = {
+        "trainings": {name: [round(float(np.mean(run)), 4) for run in runs] for name, runs in survival.items()}
+    }
+    if arguments.what == "compare":
+        found["compared"] = compared(survival, "default")
     results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
-    results.setdefault(arguments.family, {})[arguments.what] = found
+    results.setdefault(arguments.family, asdict(family))[arguments.what] = found
     write_json(RESULTS, results, indent=1)
     print(json.dumps(found, indent=1))
 

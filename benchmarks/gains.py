@@ -38,10 +38,12 @@ def go_on(run: Path) -> None:
     resume(run, evaluate=find_validator(read_config(run)[0]))
 
 
-def survival_behind(agent: Agent | Path, task_id: str, months: int | None = None) -> list[float]:
-    """Survival of each of the first ``months`` validation months behind :data:`CHOSEN_ON`; None: of all."""
+def survival_behind(agent: Agent | Path, task_id: str, months: int | None = None, *, skip: int = 0) -> list[float]:
+    """Survival of each of the first ``months`` validation months behind :data:`CHOSEN_ON` and ``skip`` more; None: of
+    all.
+    """
     task = find_task(task_id)
-    scenarios = list_scenarios(task.grid_id, VALIDATION)[CHOSEN_ON:][:months]
+    scenarios = list_scenarios(task.grid_id, VALIDATION)[CHOSEN_ON + skip :][:months]
     played = rl2grid.evaluate(agent, task, scenarios=scenarios, workers=0)
     return [round(episode.survival, 5) for episode in played.episodes]
 
