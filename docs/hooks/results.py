@@ -2,8 +2,9 @@
 
 Pages name the tasks, with ``<!-- results: bus14-T0 -->``, or with ``<!-- figure: bus14-T0 -->`` for the figure alone;
 ``<!-- overview -->`` is the table of all tasks, ``<!-- learned -->`` that of ways of learning,
-``<!-- untrained -->`` that of who learns nothing, ``<!-- heuristics -->`` agents by heuristic, ``<!-- bounds -->`` what
-those survive who know what comes, beside who does not.
+``<!-- looks -->`` what learning adds to a look, ``<!-- untrained -->`` that of who learns nothing,
+``<!-- heuristics -->`` agents by heuristic, ``<!-- bounds -->`` what those survive who know what comes, beside who does
+not.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from rl2grid.analysis.ledger_bounds import headroom_table
 from rl2grid.analysis.ledger_figure import draw_ledger
 from rl2grid.analysis.ledger_heuristics import heuristic_table
 from rl2grid.analysis.ledger_learned import learned_table
+from rl2grid.analysis.ledger_looks import looks_table
 from rl2grid.analysis.ledger_overview import overview_table
 from rl2grid.analysis.ledger_table import short_ledger_table
 from rl2grid.analysis.ledger_untrained import Milliseconds, untrained_table
@@ -30,14 +32,15 @@ from rl2grid.envs.tasks import find_task
 from rl2grid.records.ledger import HashedTest, read_ledger
 
 RESULTS = Path(__file__).resolve().parents[2] / "benchmarks" / "results"
-BASELINES, PAPER, BOUNDS, TIMES = (
-    RESULTS / f"{name}.json" for name in ("baselines", "paper", "bounds", "decision_time")
+BASELINES, PAPER, BEGINNINGS, BOUNDS, TIMES = (
+    RESULTS / f"{name}.json" for name in ("baselines", "paper", "look_alone", "bounds", "decision_time")
 )
 LEDGERS = {"results.md": BASELINES, "index.md": BASELINES, "paper.md": PAPER}
 """Of each page."""
 _TABLES = {
     "<!-- overview -->": overview_table,
     "<!-- learned -->": learned_table,
+    "<!-- looks -->": lambda results: looks_table(results, read_ledger(BEGINNINGS)),
     "<!-- heuristics -->": heuristic_table,
     "<!-- untrained -->": lambda results: untrained_table(results, _milliseconds()),
     "<!-- bounds -->": lambda results: headroom_table(results, read_ledger(BOUNDS)),
