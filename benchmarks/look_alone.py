@@ -1,9 +1,9 @@
 """How much of what policies that look before they act survive is the look: policies that have learned nothing look.
 
-``python benchmarks/look_alone.py play TASK --heuristic H --k K [--seeds 1 2] [--months 100] [--folder F]`` makes
-policies of SAC's preset ``tuned`` whose networks were never updated (the fewest decisions that it can be asked for are
-all behind its first update), lets the what-if choose of their best K actions on the first test months, each seed once,
-and enters what came out in ``benchmarks/results/look_alone.json``, which has the form of the ledger. ``python
+``python benchmarks/look_alone.py play TASK --k K [--heuristic H] [--seeds 1 2] [--months 100] [--folder F]`` makes
+policies of SAC's preset ``tuned`` whose networks were never updated (the fewest decisions that it can be asked for end
+before its first update), lets the what-if choose of their best K actions on the first test months, each seed once, and
+enters what came out in ``benchmarks/results/look_alone.json``, which has the form of the ledger. ``python
 benchmarks/look_alone.py table`` prints them as Markdown, beside the trainings of the ledger that look in the same way.
 Nothing is chosen by it.
 """
@@ -13,22 +13,27 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from gains import go_on
+
 import rl2grid
 from rl2grid.analysis.ledger_looks import looks_table
 from rl2grid.cli.main import main as command
+from rl2grid.errors import UsageError
 from rl2grid.records.ledger import read_ledger
 from rl2grid.records.trainings import is_run
 
 RESULTS = Path(__file__).resolve().parent / "results"
 LEDGER, BEGINNINGS = RESULTS / "baselines.json", RESULTS / "look_alone.json"
 FEWEST = 16 * 64
-"""Decisions of one rollout: the preset begins to learn behind 4,000."""
+"""Decisions of one rollout: the preset begins to learn after 4,000."""
 
 
-def beginning(task: str, heuristic: str, seed: int, folder: Path) -> Path:
-    """A policy before its first update; made once."""
+def beginning(task: str, heuristic: str | None, seed: int, folder: Path) -> Path:
+    """A policy before its first update; made once, or gone on with."""
     run = folder / f"{task}-{heuristic}-{seed}"
-    if not is_run(run):
+    if is_run(run):
+        go_on(run)
+    else:
         rl2grid.train(
             "sac",
             task,
@@ -49,7 +54,7 @@ def main() -> int:
     commands.add_parser("table")
     play = commands.add_parser("play")
     play.add_argument("task")
-    play.add_argument("--heuristic", required=True)
+    play.add_argument("--heuristic", help="none unless one is named")
     play.add_argument("--k", type=int, required=True, help="best actions that the what-if compares")
     play.add_argument("--seeds", type=int, nargs="+", default=[1, 2])
     play.add_argument("--months", type=int, default=100)
@@ -58,7 +63,11 @@ def main() -> int:
     if arguments.command == "table":
         print(looks_table(read_ledger(LEDGER), read_ledger(BEGINNINGS)))
         return 0
-    runs = [str(beginning(arguments.task, arguments.heuristic, seed, arguments.folder)) for seed in arguments.seeds]
+    task, heuristic, folder = arguments.task, arguments.heuristic, arguments.folder
+    try:
+        runs = [str(beginning(task, heuristic, seed, folder)) for seed in arguments.seeds]
+    except UsageError as error:
+        parser.error(str(error))
     looks = ["--months", str(arguments.months), "--top-k", str(arguments.k)]
     return command(["leaderboard", "test", *runs, *looks, "--ledger", str(BEGINNINGS)])
 
