@@ -22,7 +22,7 @@ from typing import Any
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
 import numpy as np
-from gains import CHOSEN_ON, compared, go_on, survival_behind
+from gains import CHOSEN_ON, begin_or_go_on, compared, survival_behind
 
 import rl2grid
 from rl2grid.records.files import write_json
@@ -83,10 +83,7 @@ class Stage:
         if kept.exists():
             survival: list[float] = json.loads(kept.read_text())
             return survival
-        if (run / "config.json").exists():
-            go_on(run)
-        else:
-            begin(run, family, {**self.variants[name], "seed": seed})
+        begin_or_go_on(run, lambda: begin(run, family, {**self.variants[name], "seed": seed}))
         survival = survival_behind(run, family.task, self.months, skip=self.skip)
         write_json(kept, survival)
         print(family.task, name, seed, round(float(np.mean(survival)), 3), flush=True)

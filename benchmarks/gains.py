@@ -6,7 +6,7 @@ behind them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from rl2grid.envs.tasks import Task, find_task
 from rl2grid.evaluation.protocol import first_months
 from rl2grid.records.comparisons import paired_differences
 from rl2grid.records.statistics import UNIT, Estimate, Scores, estimate
+from rl2grid.records.trainings import is_run
 from rl2grid.scenarios.library import list_scenarios
 from rl2grid.scenarios.splits import VALIDATION
 from rl2grid.training.request import read_config
@@ -33,9 +34,12 @@ def validation_months(task: Task, skip: int, months: int) -> tuple[str, ...]:
     return first_months(task, VALIDATION, skip + months)[skip:]
 
 
-def go_on(run: Path) -> None:
-    """Train an interrupted run to its end, validated as it was begun."""
-    resume(run, evaluate=find_validator(read_config(run)[0]))
+def begin_or_go_on(run: Path, begin: Callable[[], object]) -> None:
+    """Begin a run, or train one that is there, and may have been interrupted, to its end, validated as it was begun."""
+    if is_run(run):
+        resume(run, evaluate=find_validator(read_config(run)[0]))
+    else:
+        begin()
 
 
 def survival_behind(agent: Agent | Path, task_id: str, months: int | None = None, *, skip: int = 0) -> list[float]:

@@ -13,37 +13,28 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from gains import go_on
+from gains import begin_or_go_on
 
 import rl2grid
 from rl2grid.analysis.ledger_looks import looks_table
 from rl2grid.cli.main import main as command
 from rl2grid.errors import UsageError
 from rl2grid.records.ledger import read_ledger
-from rl2grid.records.trainings import is_run
+from rl2grid.training.request import hyperparameters
 
 RESULTS = Path(__file__).resolve().parent / "results"
 LEDGER, BEGINNINGS = RESULTS / "baselines.json", RESULTS / "look_alone.json"
-FEWEST = 16 * 64
-"""Decisions of one rollout: the preset begins to learn after 4,000."""
 
 
 def beginning(task: str, heuristic: str | None, seed: int, folder: Path) -> Path:
     """A policy before its first update; made once, or gone on with."""
     run = folder / f"{task}-{heuristic}-{seed}"
-    if is_run(run):
-        go_on(run)
-    else:
-        rl2grid.train(
-            "sac",
-            task,
-            folder=run,
-            preset="tuned",
-            hyperparameters={"seed": seed, "total_timesteps": FEWEST},
-            num_threads=1,
-            progress=False,
-            heuristic=heuristic,
-        )
+    preset = hyperparameters("sac", task, "tuned")
+    changes = {"seed": seed, "total_timesteps": preset.num_envs * preset.num_steps}
+    options = {"num_threads": 1, "progress": False, "heuristic": heuristic}
+    begin_or_go_on(
+        run, lambda: rl2grid.train("sac", task, folder=run, preset="tuned", hyperparameters=changes, **options)
+    )
     return run
 
 

@@ -20,7 +20,7 @@ from typing import Any
 
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
-from gains import CHOSEN_ON, compared, go_on, survival_behind
+from gains import CHOSEN_ON, begin_or_go_on, compared, survival_behind
 from rich.console import Console
 
 from rl2grid.records.files import write_json
@@ -157,11 +157,8 @@ def variants(name: str, found: Mapping[str, Any]) -> dict[str, Mapping[str, Any]
 def survival(name: str, variant: str, changes: Mapping[str, Any], seed: int, folder: Path) -> list[float]:
     """Train, or go on, and play the best policy: survival of each of the months that no trial was chosen by."""
     run = folder / f"{name}-{variant}-{seed}"
-    if run.exists():
-        go_on(run)
-    else:
-        args = run_args(_tuning(name, {}, folder), changes, run, seed)
-        train(args, evaluate=find_validator(args))
+    args = run_args(_tuning(name, {}, folder), changes, run, seed)
+    begin_or_go_on(run, lambda: train(args, evaluate=find_validator(args)))
     return survival_behind(run, EFFORT["task"])
 
 

@@ -41,3 +41,8 @@ def on(task: str, test: HashedTest, **changes: Any) -> HashedTest:
 
 def ledger(*results: HashedTest) -> dict[str, HashedTest]:
     return {identity_hash(one.configuration): one for one in results}
+
+
+def cells(table: str) -> list[list[str]]:
+    """What stands in a Markdown table, line by line."""
+    return [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines()]

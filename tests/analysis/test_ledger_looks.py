@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import pytest
-from sample_ledger import ledger, trained, untrained
+from sample_ledger import cells, ledger, trained, untrained
 
 from rl2grid.analysis.ledger_looks import looks_table
 from rl2grid.errors import UsageError
-
-
-def _cells(table: str) -> list[list[str]]:
-    return [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines()]
 
 
 def test_learning_is_compared_with_the_same_look_alone_on_the_months_that_both_played():
@@ -22,7 +18,7 @@ def test_learning_is_compared_with_the_same_look_alone_on_the_months_that_both_p
         trained(1, [0.9, 0.9, 0.9], top_k=30, algorithm="sac"),  # a single one
     )
     beginnings = ledger(*(trained(seed, [0.5, 0.5], steps=10, algorithm="sac", top_k=30) for seed in (1, 2)))
-    headings, _, row = _cells(looks_table(results, beginnings))
+    headings, _, row = cells(looks_table(results, beginnings))
     assert headings == [
         "task", "heuristic", "looking", "months", "learned nothing", "who learned", "survival", "gain", "p",
     ]  # fmt: skip
@@ -43,8 +39,8 @@ def test_p_values_are_corrected_over_the_rows_of_a_task():
         for seed in (1, 2)
     ]
     beginnings = ledger(*(trained(seed, survivals, steps=10, algorithm="sac", top_k=30) for seed in (1, 2)))
-    [[*_, alone]] = _cells(looks_table(ledger(*several[:2]), beginnings))[2:]
-    both = _cells(looks_table(ledger(*several), beginnings))[2:]
+    [[*_, alone]] = cells(looks_table(ledger(*several[:2]), beginnings))[2:]
+    both = cells(looks_table(ledger(*several), beginnings))[2:]
     assert [row[5].split()[0] for row in both] == ["ppo", "sac"]
     assert [float(row[8]) for row in both] == pytest.approx([2 * float(alone)] * 2, abs=0.002)
 

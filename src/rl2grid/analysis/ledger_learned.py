@@ -86,6 +86,10 @@ def _cell(row: LedgerRow, months: int, highest: float) -> str:
     is_highest = aggregated(scores) == highest
     if not row.first.training:
         return highlighted(f"{aggregated(scores):.3f}", is_highest)
-    survival = highlighted(with_interval(estimate(scores), 3), is_highest)
+    return f"{highlighted(with_interval(estimate(scores), 3), is_highest)} ({trainings_text(row)})"
+
+
+def trainings_text(row: LedgerRow) -> str:
+    """The number of trainings and the decisions of each, as "3 of 100,000"."""
     decisions = int(row.first.configuration["hyperparameters"]["total_timesteps"])
-    return f"{survival} ({len(row.results)} of {decisions:,})"
+    return f"{len(row.results)} of {decisions:,}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from rl2grid.analysis.ledger_learned import SEVERAL
+from rl2grid.analysis.ledger_learned import SEVERAL, trainings_text
 from rl2grid.analysis.ledger_overview import by_task
 from rl2grid.analysis.ledger_table import LedgerRow
 from rl2grid.analysis.table import difference_cell, markdown_row, p_cell, with_interval
@@ -80,7 +80,5 @@ def _task_and_look(result: HashedTest) -> tuple[str, str, str]:
 
 
 def _who(row: LedgerRow) -> str:
-    """Who learned, the number of trainings and the decisions of each."""
-    learned = row.player.replace(looking_of(row.first.configuration), "")
-    decisions = int(row.first.configuration["hyperparameters"]["total_timesteps"])
-    return f"{learned} ({len(row.results)} of {decisions:,})"
+    """Who learned, and by how many trainings."""
+    return f"{row.first.policy}{row.told_by} ({trainings_text(row)})"

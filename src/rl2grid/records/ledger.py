@@ -91,15 +91,20 @@ class HashedTest:
         return int(self.configuration.get("heuristic_rules", 1))
 
     @property
-    def player(self) -> str:
-        """The agent, and what is not as usual: network, features, reward; and how it looks before it acts."""
+    def policy(self) -> str:
+        """The agent, and what is not as usual: network, features, reward."""
         network = self.configuration.get("hyperparameters", {}).get("network", "mlp")
         keywords = self.configuration.get("env_keywords", {})
         features, reward = keywords.get("operator_features"), keywords.get("reward", "default")
         observing = "" if features is None else f", observing {features}"
         paid = "" if reward == "default" else f", reward {_reward_text(reward)}"
         with_network = "" if network == "mlp" else f", {network}"
-        return f"{self.agent}{with_network}{observing}{paid}{looking_of(self.configuration)}"
+        return f"{self.agent}{with_network}{observing}{paid}"
+
+    @property
+    def player(self) -> str:
+        """See :attr:`policy`, and how it looks before it acts."""
+        return f"{self.policy}{looking_of(self.configuration)}"
 
     @property
     def label(self) -> str:
