@@ -1,12 +1,13 @@
-"""PPO's discount, learning rates, size and updates on larger grids, each changed alone, and what looked best again.
+"""Hyperparameters of PPO and SAC on larger grids, each changed alone, and what looked best again with other seeds.
 
 ``python benchmarks/families.py search FAMILY --folder F`` trains PPO's preset ``default`` and variants of it on a task
 of the family, with two seeds, each on 100,000 decisions, keeps the policy that survives longest on the first 20
-validation months and plays it on the 60 behind these. ``... compare FAMILY --folder F`` trains the default, the two
-variants that were best on 36 substations and both changes at once with seeds that the search did not use, and plays
-them on the 120 validation months that it did not play. Both go on after an interruption, write
-``benchmarks/results/families.json`` and print what they wrote. ``--only NAME`` trains one variant and
-writes nothing, for several processes side by side. Test months are never played.
+validation months and plays it on the 60 behind these. ``... compare FAMILY --folder F`` trains the preset, the
+variants that were best on 36 substations and their changes at once with seeds that the search did not use, and plays
+them on the 120 validation months that it did not play. ``--algorithm sac`` does the same with SAC's preset ``tuned``
+and variants of it. All go on after an interruption, write ``benchmarks/results/families.json`` and print what they
+wrote. ``--only NAME`` trains one variant and writes nothing, for several processes side by side. Test months are never
+played.
 """
 
 from __future__ import annotations
@@ -31,26 +32,49 @@ RESULTS = Path(__file__).resolve().parent / "results" / "families.json"
 BUDGET, VALIDATIONS = 100_000, 5
 SEARCHED = 60
 """How many of the months behind those that chose a policy are played by a search; others compare what it found."""
+PRESET = "preset"
+"""The variant that changes nothing."""
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """What is trained of an algorithm: variants of a preset, each named after what it changes."""
+
+    preset: str
+    searched: Mapping[str, Mapping[str, Any]]
+    compared: Mapping[str, Mapping[str, Any]]
+    """The preset, what was best of the search, and its changes at once; where nothing was better, what was searched."""
+
+
 _SLOWER: dict[str, Any] = {"actor_learning_rate": 3e-4, "critic_learning_rate": 3e-4}
 _LARGER: dict[str, Any] = {"num_envs": 64, "num_steps": 32, "num_minibatches": 8}
-VARIANTS: dict[str, dict[str, Any]] = {
-    "default": {},
-    "gamma 0.95": {"gamma": 0.95},
-    "gamma 0.99": {"gamma": 0.99},
-    "rates 0.0003": _SLOWER,
-    "rates 0.003": {"actor_learning_rate": 3e-3, "critic_learning_rate": 3e-3},
-    "layers of 64": {"actor_layers": [64, 64], "critic_layers": [64, 64]},
-    "layers of 256": {"actor_layers": [256, 256], "critic_layers": [256, 256]},
-    "updates of 2,048": _LARGER,
+_OF_SAC: dict[str, dict[str, Any]] = {
+    PRESET: {},
+    "rates 0.001": {"actor_learning_rate": 1e-3, "critic_learning_rate": 1e-3},
+    "an update every 8 decisions": {"train_frequency": 8},
 }
-"""What each changes of the preset ``default``."""
-FINALISTS: dict[str, dict[str, Any]] = {
-    "default": {},
-    "rates 0.0003": _SLOWER,
-    "updates of 2,048": _LARGER,
-    "updates of 2,048, rates 0.0003": {**_LARGER, **_SLOWER},
+CANDIDATES = {
+    "ppo": Candidates(
+        "default",
+        {
+            PRESET: {},
+            "gamma 0.95": {"gamma": 0.95},
+            "gamma 0.99": {"gamma": 0.99},
+            "rates 0.0003": _SLOWER,
+            "rates 0.003": {"actor_learning_rate": 3e-3, "critic_learning_rate": 3e-3},
+            "layers of 64": {"actor_layers": [64, 64], "critic_layers": [64, 64]},
+            "layers of 256": {"actor_layers": [256, 256], "critic_layers": [256, 256]},
+            "updates of 2,048": _LARGER,
+        },
+        {
+            PRESET: {},
+            "rates 0.0003": _SLOWER,
+            "updates of 2,048": _LARGER,
+            "updates of 2,048, rates 0.0003": {**_LARGER, **_SLOWER},
+        },
+    ),
+    "sac": Candidates("tuned", _OF_SAC, _OF_SAC),
 }
-"""What is compared: what was best of the search, and the default."""
 
 
 @dataclass(frozen=True)
@@ -67,44 +91,54 @@ FAMILIES = {"36": Family("bus36-M-T0", "careful"), "118": Family("bus118-M-T0", 
 
 @dataclass(frozen=True)
 class Stage:
-    """A search, or what compares its finds: what is trained, and the months that are played."""
+    """A search, or what compares its finds: with which seeds, and the months that are played."""
 
-    variants: Mapping[str, Mapping[str, Any]]
     seeds: tuple[int, ...]
     skip: int
     """Months behind those that choose a policy which are not played."""
     months: int | None
     """How many are played then; None: all."""
 
-    def survival(self, family: Family, name: str, seed: int, folder: Path) -> list[float]:
+
+STAGES = {"search": Stage((1, 2), 0, SEARCHED), "compare": Stage((11, 12, 13), SEARCHED, None)}
+
+
+@dataclass(frozen=True)
+class Trainings:
+    """Trainings of variants on a family of grids, kept in a folder."""
+
+    algorithm: str
+    family: Family
+    stage: Stage
+    folder: Path
+
+    def survival(self, variant: str, changes: Mapping[str, Any], seed: int) -> list[float]:
         """Train a variant, or go on, and play the best policy: survival of the months; kept in the folder."""
-        label = f"{family.task}-{name.replace(',', '').replace(' ', '-')}-{seed}"
-        run, kept = folder / label, folder / f"{label}.json"
+        task = self.family.task
+        label = f"{self.algorithm}-{task}-{variant.replace(',', '').replace(' ', '-')}-{seed}"
+        run, kept = self.folder / label, self.folder / f"{label}.json"
         if kept.exists():
             survival: list[float] = json.loads(kept.read_text())
             return survival
-        begin_or_go_on(run, lambda: begin(run, family, {**self.variants[name], "seed": seed}))
-        survival = survival_behind(run, family.task, self.months, skip=self.skip)
+        begin_or_go_on(run, lambda: self._begin(run, {**changes, "seed": seed}))
+        survival = survival_behind(run, task, self.stage.months, skip=self.stage.skip)
         write_json(kept, survival)
-        print(family.task, name, seed, round(float(np.mean(survival)), 3), flush=True)
+        print(self.algorithm, task, variant, seed, round(float(np.mean(survival)), 3), flush=True)
         return survival
 
-
-STAGES = {"search": Stage(VARIANTS, (1, 2), 0, SEARCHED), "compare": Stage(FINALISTS, (11, 12, 13), SEARCHED, None)}
-
-
-def begin(run: Path, family: Family, hyperparameters: Mapping[str, Any]) -> None:
-    """Train from the beginning."""
-    rl2grid.train(
-        "ppo",
-        family.task,
-        folder=run,
-        hyperparameters={**hyperparameters, "total_timesteps": BUDGET, "torch_threads": 1},
-        validation_months=CHOSEN_ON,
-        evaluate_every=BUDGET // VALIDATIONS,
-        progress=False,
-        heuristic=family.heuristic,
-    )
+    def _begin(self, run: Path, changes: Mapping[str, Any]) -> None:
+        """Train from the beginning."""
+        rl2grid.train(
+            self.algorithm,
+            self.family.task,
+            folder=run,
+            preset=CANDIDATES[self.algorithm].preset,
+            hyperparameters={**changes, "total_timesteps": BUDGET, "torch_threads": 1},
+            validation_months=CHOSEN_ON,
+            evaluate_every=BUDGET // VALIDATIONS,
+            progress=False,
+            heuristic=self.family.heuristic,
+        )
 
 
 def main() -> None:
@@ -112,15 +146,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=tuple(STAGES))
     parser.add_argument("family", choices=tuple(FAMILIES))
+    parser.add_argument("--algorithm", choices=tuple(CANDIDATES), default="ppo")
     parser.add_argument("--only", metavar="NAME", help="train this variant and write nothing else")
     parser.add_argument("--folder", type=Path, default=Path("families"), help="where trainings are kept")
     arguments = parser.parse_args()
     family, stage = FAMILIES[arguments.family], STAGES[arguments.what]
-    if arguments.only and arguments.only not in stage.variants:
-        parser.error(f"To {arguments.what}, train one of {', '.join(map(repr, stage.variants))}.")
+    candidates = CANDIDATES[arguments.algorithm]
+    variants = candidates.searched if arguments.what == "search" else candidates.compared
+    if arguments.only and arguments.only not in variants:
+        parser.error(f"To {arguments.what}, train one of {', '.join(map(repr, variants))}.")
+    trainings = Trainings(arguments.algorithm, family, stage, arguments.folder)
     survival = {
-        name: [stage.survival(family, name, seed, arguments.folder) for seed in stage.seeds]
-        for name in ([arguments.only] if arguments.only else stage.variants)
+        name: [trainings.survival(name, variants[name], seed) for seed in stage.seeds]
+        for name in ([arguments.only] if arguments.only else variants)
     }
     if arguments.only:
         return
@@ -128,9 +166,9 @@ def main() -> None:
         "trainings": {name: [round(float(np.mean(run)), 4) for run in runs] for name, runs in survival.items()}
     }
     if arguments.what == "compare":
-        found["compared"] = compared(survival, "default")
+        found["compared"] = compared(survival, PRESET)
     results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
-    results.setdefault(arguments.family, asdict(family))[arguments.what] = found
+    results.setdefault(arguments.family, asdict(family)).setdefault(arguments.algorithm, {})[arguments.what] = found
     write_json(RESULTS, results, indent=1)
     print(json.dumps(found, indent=1))
 
