@@ -41,9 +41,10 @@ class Candidates:
     """What is trained of an algorithm: variants of a preset, each named after what it changes."""
 
     preset: str
-    searched: Mapping[str, Mapping[str, Any]]
-    compared: Mapping[str, Mapping[str, Any]]
-    """The preset, what was best of the search, and its changes at once; where nothing was better, what was searched."""
+    variants: Mapping[str, Mapping[str, Mapping[str, Any]]]
+    """By stage. Compared are the preset, what was best of the search and its changes at once; of SAC, where nothing was
+    better, what was searched.
+    """
 
 
 _SLOWER: dict[str, Any] = {"actor_learning_rate": 3e-4, "critic_learning_rate": 3e-4}
@@ -57,23 +58,25 @@ CANDIDATES = {
     "ppo": Candidates(
         "default",
         {
-            PRESET: {},
-            "gamma 0.95": {"gamma": 0.95},
-            "gamma 0.99": {"gamma": 0.99},
-            "rates 0.0003": _SLOWER,
-            "rates 0.003": {"actor_learning_rate": 3e-3, "critic_learning_rate": 3e-3},
-            "layers of 64": {"actor_layers": [64, 64], "critic_layers": [64, 64]},
-            "layers of 256": {"actor_layers": [256, 256], "critic_layers": [256, 256]},
-            "updates of 2,048": _LARGER,
-        },
-        {
-            PRESET: {},
-            "rates 0.0003": _SLOWER,
-            "updates of 2,048": _LARGER,
-            "updates of 2,048, rates 0.0003": {**_LARGER, **_SLOWER},
+            "search": {
+                PRESET: {},
+                "gamma 0.95": {"gamma": 0.95},
+                "gamma 0.99": {"gamma": 0.99},
+                "rates 0.0003": _SLOWER,
+                "rates 0.003": {"actor_learning_rate": 3e-3, "critic_learning_rate": 3e-3},
+                "layers of 64": {"actor_layers": [64, 64], "critic_layers": [64, 64]},
+                "layers of 256": {"actor_layers": [256, 256], "critic_layers": [256, 256]},
+                "updates of 2,048": _LARGER,
+            },
+            "compare": {
+                PRESET: {},
+                "rates 0.0003": _SLOWER,
+                "updates of 2,048": _LARGER,
+                "updates of 2,048, rates 0.0003": {**_LARGER, **_SLOWER},
+            },
         },
     ),
-    "sac": Candidates("tuned", _OF_SAC, _OF_SAC),
+    "sac": Candidates("tuned", {"search": _OF_SAC, "compare": _OF_SAC}),
 }
 
 
@@ -133,7 +136,8 @@ class Trainings:
             self.family.task,
             folder=run,
             preset=CANDIDATES[self.algorithm].preset,
-            hyperparameters={**changes, "total_timesteps": BUDGET, "torch_threads": 1},
+            hyperparameters={**changes, "total_timesteps": BUDGET},
+            num_threads=1,
             validation_months=CHOSEN_ON,
             evaluate_every=BUDGET // VALIDATIONS,
             progress=False,
@@ -151,8 +155,7 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, default=Path("families"), help="where trainings are kept")
     arguments = parser.parse_args()
     family, stage = FAMILIES[arguments.family], STAGES[arguments.what]
-    candidates = CANDIDATES[arguments.algorithm]
-    variants = candidates.searched if arguments.what == "search" else candidates.compared
+    variants = CANDIDATES[arguments.algorithm].variants[arguments.what]
     if arguments.only and arguments.only not in variants:
         parser.error(f"To {arguments.what}, train one of {', '.join(map(repr, variants))}.")
     trainings = Trainings(arguments.algorithm, family, stage, arguments.folder)
