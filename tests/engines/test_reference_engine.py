@@ -1,6 +1,9 @@
 """The reference engine plays what an unmodified Grid2Op environment plays."""
 
+import gc
+import sys
 import warnings
+import weakref
 from pathlib import Path
 
 import grid2op
@@ -169,6 +172,25 @@ def test_copies_are_independent():
     assert not np.array_equal(engine.state.topo_vect[0], engine.state.topo_vect[1])
     engine.step(1, full_catalogue(grid)[5])
     np.testing.assert_array_equal(engine.state.rho[0], engine.state.rho[1])
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_an_engine_that_is_forgotten_is_closed_without_a_complaint(monkeypatch, closed):
+    """Grid2Op's finalizers raise where the garbage collector comes to the forecasts before their environment."""
+    complaints = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda complaint: complaints.append(complaint.exc_value))
+    engine = ReferenceEngine(load_grid("bus14"), 2)
+    engine.reset(0, EpisodePlan(0, 0, list_scenarios("bus14", "bundled")[0], 0, 100))
+    gc.collect()  # which changes the order in which it comes to them
+    gc.collect()
+    if closed:
+        engine.close()
+        engine.close()
+    engine.itself, environment = engine, weakref.ref(engine.grid2op_environment(1))
+    del engine
+    gc.collect()
+    assert environment() is None
+    assert complaints == []
 
 
 def test_game_over_is_explained_and_blanked():

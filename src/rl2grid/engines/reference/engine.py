@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import os
 import warnings
+import weakref
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -60,6 +62,9 @@ class ReferenceEngine:
         self._home = Home("reference", grid.id, grid_fingerprint(grid), dispatch, self.attacks, _LAYOUT)
         self._opponent = new_opponent_state(grid, n) if self.attacks else None
         self._environments = self._make_environments(n)
+        # Closed before the garbage collector comes to them: Grid2Op's finalizers fail where it comes to a part first.
+        self._closing = weakref.finalize(self, _close, self._environments)
+        self._closing.atexit = False
         self._do_nothing = [environment.action_space() for environment in self._environments]
         self._observations: list[Any] = [None] * n
         self._observed = (*OBSERVED, *OBSERVED_STORAGE) if grid.n_storage else OBSERVED
@@ -193,9 +198,8 @@ class ReferenceEngine:
         return list(self.state[GridState._fields.index("gen_p") :])
 
     def close(self) -> None:
-        """Close the Grid2Op environments."""
-        for environment in self._environments:
-            environment.close()
+        """Close the Grid2Op environments, which happens by itself to an engine that nobody refers to any more."""
+        self._closing()
 
     def _make_environments(self, n: int) -> list[Any]:
         scenario = load_scenario(self.grid.id, list_scenarios(self.grid.id, "bundled")[0])
@@ -312,6 +316,11 @@ def _rebuild(grid: Grid, dispatch: str, opponent: bool, worlds: list[World | Non
         if world is not None:
             engine.restore(i, world)
     return engine
+
+
+def _close(environments: Iterable[Any]) -> None:
+    for environment in environments:
+        environment.close()
 
 
 def _make_grid2op(grid: Grid, scenario: Any, dispatch: str) -> Any:
