@@ -1,5 +1,6 @@
 """What all tests share."""
 
+import gc
 import os
 
 import pytest
@@ -9,6 +10,11 @@ from rl2grid.scenarios.making import MAKERS
 
 os.environ[VARIABLE] = "1"  # what commands print is compared, whether or not something was compiled before
 os.environ[MAKERS] = "0"  # tests need few years of training, and all cores
+
+
+def pytest_collection_finish():
+    """Libraries stay: the collector need not visit their million objects again and again."""
+    gc.freeze()
 
 
 @pytest.fixture(scope="session", autouse=True)
