@@ -133,7 +133,7 @@ class ReferenceEngine:
         return result
 
     def grid2op_environment(self, i: int) -> Any:
-        """The ``grid2op.Environment`` behind environment ``i``."""
+        """The ``grid2op.Environment`` behind environment ``i``, which is closed with this engine: keep that as well."""
         return self._environments[i]
 
     def save(self, i: int) -> World:
