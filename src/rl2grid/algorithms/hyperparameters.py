@@ -87,6 +87,8 @@ class SharedArgs:
         self._check_counts("num_envs", "num_steps", "torch_threads")
         self._check_shares("gamma")
         self._check_positive("max_grad_norm")
+        if self.reward_scale is not None:
+            self._check_positive("reward_scale")
         if self.device not in DEVICES:
             raise one_of("Device", self.device, DEVICES)
         if self.seed < 0:
@@ -120,9 +122,12 @@ class SharedArgs:
                 raise UsageError(f"{self.algorithm} needs {name} of at least 0, not {getattr(self, name)}.")
 
     def _check_shares(self, *names: str) -> None:
+        self._check_between(0, 1, *names)
+
+    def _check_between(self, low: int, high: int, *names: str) -> None:
         for name in names:
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise UsageError(f"{self.algorithm} needs {name} between 0 and 1, not {getattr(self, name)}.")
+            if not low <= getattr(self, name) <= high:
+                raise UsageError(f"{self.algorithm} needs {name} between {low} and {high}, not {getattr(self, name)}.")
 
     def _check_probability(self, name: str) -> None:
         """None, or a probability that is neither 0 nor 1."""

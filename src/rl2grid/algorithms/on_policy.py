@@ -60,6 +60,9 @@ from rl2grid.arrays import F32, Flags
 
 # --- Hyperparameters ------------------------------------------------------------------------------------------------
 
+LOG_STD_LIMITS = (-20, 2)
+"""Between which log standard deviations may start: from draws that are all alike to such as seldom fit the bounds."""
+
 
 @dataclass(frozen=True)
 class OnPolicyArgs(TeacherArgs):
@@ -90,7 +93,7 @@ class OnPolicyArgs(TeacherArgs):
     initial_do_nothing: float | None = None
     """Discrete actions only: probability of action 0 before training; None: all actions are about alike."""
     initial_log_std: float = -1.0
-    """Continuous actions only: where the trained log standard deviations start."""
+    """Continuous actions only: where the trained log standard deviations start. Actions are from -1 to 1."""
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work; see :class:`SharedArgs`."""
@@ -100,6 +103,9 @@ class OnPolicyArgs(TeacherArgs):
         self._check_positive("actor_learning_rate", "critic_learning_rate")
         self._check_layers("actor_layers", "critic_layers")
         self._check_probability("initial_do_nothing")
+        self._check_between(*LOG_STD_LIMITS, "initial_log_std")
+        if self.target_kl is not None:
+            self._check_positive("target_kl")
 
 
 # --- Networks -------------------------------------------------------------------------------------------------------

@@ -62,6 +62,7 @@ class Args(OnPolicyArgs):
         """Refuse values that cannot work; see :class:`OnPolicyArgs`."""
         super().__post_init__()
         self._check_positive("clip_coefficient")
+        self._check_not_negative("entropy_coefficient", "value_coefficient")
 
 
 def default(*, continuous: bool) -> Args:

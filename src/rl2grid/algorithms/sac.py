@@ -110,6 +110,10 @@ class Args(OffPolicyArgs, TeacherArgs):
         self._check_shares("tau", "first_entropy_share", "last_entropy_share")
         self._check_layers("actor_layers", "critic_layers")
         self._check_probability("initial_do_nothing")
+        if not -math.inf < self.entropy_per_dimension <= math.log(2.0):
+            raise UsageError(
+                f"SAC needs a finite entropy_per_dimension of at most log 2 = 0.69, not {self.entropy_per_dimension}."
+            )
 
 
 def default(*, continuous: bool) -> Args:
