@@ -35,7 +35,6 @@ from rl2grid.mdp.opponents import draw_opponent
 from rl2grid.powerflow.batch import NOTHING, SWITCH, Changes, Snapshot
 from rl2grid.powerflow.model import load_network
 from rl2grid.records.ledger import read_ledger
-from rl2grid.records.month_values import unpack_months
 from rl2grid.records.statistics import UNIT, Scores, estimate, median_score
 from rl2grid.scenarios.generator import generate_month
 from rl2grid.scenarios.generator.calendar import MONTH_ROWS, MONTH_STEPS, MONTHS, ROWS_PER_DAY, ROWS_PER_HOUR
@@ -90,7 +89,7 @@ def tested(grid_id: str) -> str:
     """A row of a Markdown table: months, mean and median with their intervals, mean of each season."""
     tests = read_ledger(LEDGER).values()
     (test,) = (one for one in tests if one.label == "do-nothing" and one.task == find_task(f"{grid_id}-T0").id)
-    values = unpack_months(test.values, 1)["survival"]
+    values = test.by_month["survival"]
     names = list_scenarios(grid_id, TEST)[: len(values)]
     months = np.array([parse_months(name.removeprefix("generated/")).first for name in names])
     scores = Scores(values[None], UNIT)

@@ -13,7 +13,7 @@ from rl2grid.arrays import F64
 from rl2grid.envs.tasks import short_id
 from rl2grid.errors import UsageError
 from rl2grid.records.ledger import HashedTest
-from rl2grid.records.month_values import common_months, unpack_months
+from rl2grid.records.month_values import common_months
 from rl2grid.records.statistics import aggregated
 
 _HEADINGS = ("task", "heuristic", "months", *KINDS, "with foresight", "anybody", "the planner reaches")
@@ -75,7 +75,7 @@ def _others(bound: HashedTest, results: Mapping[str, HashedTest]) -> list[Hashed
 
 
 def _survived(result: HashedTest, months: int) -> F64:
-    return unpack_months(result.values, int(result.months["seeds"]))["survival"][:months]
+    return result.by_month["survival"][:months]
 
 
 def _survival(row: LedgerRow, months: int) -> float:

@@ -18,7 +18,7 @@ from rl2grid.mdp.constraint_table import CONSTRAINTS, THRESHOLDS
 from rl2grid.records.comparisons import Difference, holm, paired_differences
 from rl2grid.records.ledger import HashedTest
 from rl2grid.records.looks import budget, by_present_rules, earlier_choices, is_outdated, latest_rules, method_of
-from rl2grid.records.month_values import common_months, unpack_months
+from rl2grid.records.month_values import common_months
 from rl2grid.records.statistics import UNIT, Scores, estimate
 from rl2grid.records.versions import TARGETS_VERSION
 
@@ -83,9 +83,8 @@ class LedgerRow:
 
     def scores(self, column: str, months: int | None = None, *, of_last: bool = False) -> Scores:
         """A column of the tests, seeds of the training as runs; the first ``months`` of them."""
-        seeds = int(self.first.months["seeds"])
-        columns = [one.last if of_last and one.last else one.values for one in self.results]
-        values = [unpack_months(one, seeds)[column][:months] for one in columns]
+        tests = [one.last_by_month if of_last else one.by_month for one in self.results]
+        values = [of_months[column][:months] for of_months in tests]
         return Scores(np.stack(values), UNIT if column in ("survival", "completed") else (0.0, np.inf))
 
     def safe(self, constraint: str) -> Scores:

@@ -11,14 +11,15 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
+from rl2grid.arrays import F64
 from rl2grid.records.evaluations import Evaluation, identity_hash
 from rl2grid.records.files import CHECKSUM, checksum, misfit, not_what, read_json, write_json
 from rl2grid.records.locks import locked
-from rl2grid.records.month_values import pack_months
+from rl2grid.records.month_values import pack_months, unpack_months
 from rl2grid.records.trainings import chosen_of_labels, chosen_of_start
 
 _REMEDY = "give a file that 'rl2grid leaderboard test' wrote, or one that does not exist yet"
@@ -115,6 +116,16 @@ class HashedTest:
     def has_learned(self) -> bool:
         """Whether a policy was played; of those of the package, the ledger tells no training."""
         return bool(self.training) or "policy_hash" in self.configuration
+
+    @functools.cached_property
+    def by_month(self) -> dict[str, F64]:
+        """See :func:`~rl2grid.records.month_values.unpack_months`: of the best policy, or of the agent."""
+        return unpack_months(self.values, int(self.months["seeds"]))
+
+    @functools.cached_property
+    def last_by_month(self) -> dict[str, F64]:
+        """The same of the last policy."""
+        return unpack_months(self.last, int(self.months["seeds"])) if self.last else self.by_month
 
     @functools.cached_property
     def choice(self) -> str:
@@ -227,7 +238,7 @@ def _checksum(result: HashedTest) -> str:
 
 def _stored(result: HashedTest) -> dict[str, Any]:
     """A result as it stands in a ledger."""
-    entries = asdict(result)
+    entries = {entry.name: getattr(result, entry.name) for entry in fields(result)}
     if not result.checksum:
         del entries[CHECKSUM]
     return entries
