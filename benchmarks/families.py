@@ -3,11 +3,11 @@
 ``python benchmarks/families.py search FAMILY --folder F`` trains PPO's preset ``default`` and variants of it on a task
 of the family, with two seeds, each on 100,000 decisions, keeps the policy that survives longest on the first 20
 validation months and plays it on the 60 behind these. ``... compare FAMILY --folder F`` trains the preset, the
-variants that were best on 36 substations and their changes at once with seeds that the search did not use, and plays
+variants that were best on 36 substations, and their changes at once, with seeds that the search did not use, and plays
 them on the 120 validation months that it did not play. ``--algorithm sac`` does the same with SAC's preset ``tuned``
-and variants of it. All go on after an interruption, write ``benchmarks/results/families.json`` and print what they
-wrote. ``--only NAME`` trains one variant and writes nothing, for several processes side by side. Test months are never
-played.
+and variants of it. The family ``36-R`` is of redispatch, for PPO alone. All go on after an interruption, write
+``benchmarks/results/families.json`` and print what they wrote. ``--only NAME`` trains one variant and writes nothing,
+for several processes side by side. Test months are never played.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import argparse
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +54,7 @@ _OF_SAC: dict[str, dict[str, Any]] = {
     "rates 0.001": {"actor_learning_rate": 1e-3, "critic_learning_rate": 1e-3},
     "an update every 8 decisions": {"train_frequency": 8},
 }
-CANDIDATES = {
+TOPOLOGY = {
     "ppo": Candidates(
         "default",
         {
@@ -78,6 +78,25 @@ CANDIDATES = {
     ),
     "sac": Candidates("tuned", {"search": _OF_SAC, "compare": _OF_SAC}),
 }
+_WIDE: dict[str, Any] = {"initial_log_std": 0.0}
+"""First draws with a deviation of 1, all that can be asked for, in place of 0.37."""
+REDISPATCH = {
+    "ppo": Candidates(
+        "default",
+        {
+            "search": {
+                PRESET: {},
+                "wide": _WIDE,
+                "wide, gamma 0.95": {**_WIDE, "gamma": 0.95},
+                "wide, gamma 0.998": {**_WIDE, "gamma": 0.998},
+                "wide, rates 0.001": {**_WIDE, "actor_learning_rate": 1e-3, "critic_learning_rate": 1e-3},
+                "wide, updates of 256": {**_WIDE, "num_steps": 16},
+                "wide, updates of 2,048": {**_WIDE, **_LARGER},
+            },
+            "compare": {PRESET: {}, "wide": _WIDE},
+        },
+    ),
+}
 
 
 @dataclass(frozen=True)
@@ -86,10 +105,16 @@ class Family:
 
     task: str
     heuristic: str
-    """By which greedy search survives longest."""
+    """By which greedy search survives longest, or of redispatch what policies learned."""
+    candidates: Mapping[str, Candidates]
+    """By algorithm."""
 
 
-FAMILIES = {"36": Family("bus36-M-T0", "careful"), "118": Family("bus118-M-T0", "careful")}
+FAMILIES = {
+    "36": Family("bus36-M-T0", "careful", TOPOLOGY),
+    "118": Family("bus118-M-T0", "careful", TOPOLOGY),
+    "36-R": Family("bus36-M-R", "recovery", REDISPATCH),
+}
 
 
 @dataclass(frozen=True)
@@ -135,7 +160,7 @@ class Trainings:
             self.algorithm,
             self.family.task,
             folder=run,
-            preset=CANDIDATES[self.algorithm].preset,
+            preset=self.family.candidates[self.algorithm].preset,
             hyperparameters={**changes, "total_timesteps": BUDGET},
             num_threads=1,
             validation_months=CHOSEN_ON,
@@ -150,12 +175,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=tuple(STAGES))
     parser.add_argument("family", choices=tuple(FAMILIES))
-    parser.add_argument("--algorithm", choices=tuple(CANDIDATES), default="ppo")
+    parser.add_argument("--algorithm", choices=tuple(TOPOLOGY), default="ppo")
     parser.add_argument("--only", metavar="NAME", help="train this variant and write nothing else")
     parser.add_argument("--folder", type=Path, default=Path("families"), help="where trainings are kept")
     arguments = parser.parse_args()
     family, stage = FAMILIES[arguments.family], STAGES[arguments.what]
-    variants = CANDIDATES[arguments.algorithm].variants[arguments.what]
+    if arguments.algorithm not in family.candidates:
+        parser.error(f"Of family {arguments.family}, train {', '.join(family.candidates)}.")
+    variants = family.candidates[arguments.algorithm].variants[arguments.what]
     if arguments.only and arguments.only not in variants:
         parser.error(f"To {arguments.what}, train one of {', '.join(map(repr, variants))}.")
     trainings = Trainings(arguments.algorithm, family, stage, arguments.folder)
@@ -171,7 +198,8 @@ def main() -> None:
     if arguments.what == "compare":
         found["compared"] = compared(survival, PRESET)
     results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
-    results.setdefault(arguments.family, asdict(family)).setdefault(arguments.algorithm, {})[arguments.what] = found
+    where = {"task": family.task, "heuristic": family.heuristic}
+    results.setdefault(arguments.family, where).setdefault(arguments.algorithm, {})[arguments.what] = found
     write_json(RESULTS, results, indent=1)
     print(json.dumps(found, indent=1))
 

@@ -653,7 +653,7 @@ def test_presets_can_be_changed_and_unknown_ones_are_refused():
     assert preset("default", continuous=False, seed=9).seed == 9
     assert preset("default", continuous=False).mask_actions
     assert not preset("default", continuous=True).mask_actions
-    with pytest.raises(UsageError, match="choose one of default, paper"):
+    with pytest.raises(UsageError, match="choose one of default, paper, tuned"):
         preset("papers", continuous=False)
 
 

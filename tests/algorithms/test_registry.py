@@ -22,7 +22,7 @@ from rl2grid.errors import UsageError
 from rl2grid.studies.tuning import WEIGHT_CHOICES, search_space
 from rl2grid.training.request import hyperparameters
 
-TUNING = Path(__file__).resolve().parents[2] / "benchmarks" / "results" / "tuning.json"
+RESULTS = Path(__file__).resolve().parents[2] / "benchmarks" / "results"
 OURS = ("ppo", "lagrangian-ppo", "dqn", "sac", "td3", "imitation")
 
 
@@ -63,7 +63,7 @@ def test_each_is_found_by_its_name(name: str):
 
 
 def test_the_preset_tuned_is_what_the_search_found():
-    found = json.loads(TUNING.read_text())["algorithms"]["sac"]["hyperparameters"]
+    found = json.loads((RESULTS / "tuning.json").read_text())["algorithms"]["sac"]["hyperparameters"]
     tuned, usual = (find_algorithm("sac").preset(preset, continuous=False) for preset in ("tuned", "default"))
     for key, value in found.items():
         assert getattr(tuned, key) == (tuple(value) if isinstance(value, list) else pytest.approx(value, rel=0.05)), key
@@ -71,9 +71,19 @@ def test_the_preset_tuned_is_what_the_search_found():
     assert {key: vars(tuned)[key] for key in others} == {key: vars(usual)[key] for key in others}
 
 
-def test_nothing_was_searched_for_continuous_actions():
+def test_of_redispatch_it_is_what_survived_longest_in_the_search_and_again_with_other_seeds():
+    found = json.loads((RESULTS / "families.json").read_text())["36-R"]["ppo"]
+    survival = {name: sum(trainings) for name, trainings in found["search"]["trainings"].items()}
+    assert max(survival, key=survival.get) == "wide"  # type: ignore[arg-type]
+    assert found["compare"]["compared"]["wide"]["p"] < 0.05
+    tuned, usual = (find_algorithm("ppo").preset(preset, continuous=True) for preset in ("tuned", "default"))
+    assert tuned == replace(usual, initial_log_std=0.0)
+
+
+@pytest.mark.parametrize(("name", "continuous"), [("sac", True), ("ppo", False)])
+def test_where_nothing_was_found_it_is_refused(name: str, continuous: bool):
     with pytest.raises(UsageError, match="choose 'default' or 'paper'"):
-        find_algorithm("sac").preset("tuned", continuous=True)
+        find_algorithm(name).preset("tuned", continuous=continuous)
 
 
 def test_kinds_of_tasks_and_names():
