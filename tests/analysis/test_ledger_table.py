@@ -100,6 +100,20 @@ def test_rows_are_compared_with_the_reference_by_its_present_rules():
     assert cells(table, "bus14-T0 do-nothing")["to planner"].startswith("-0.450 [")
 
 
+def test_a_row_that_a_hyperparameter_tells_from_others_is_compared_with_by_its_whole_name():
+    common = {"seed": 1, "total_timesteps": 1000}
+    results = ledger(
+        *(
+            trained(1, survivals, hyperparameters={**common, "gamma": gamma})
+            for gamma, survivals in ((0.9, [0.2, 0.4]), (0.99, [0.7, 0.9]))
+        )
+    )
+    by_name = ledger_table(results, TASK, "ppo + idle (gamma 0.99)")
+    assert cells(by_name, "bus14-T0 ppo (gamma 0.9)")["to ppo + idle (gamma 0.99)"].startswith("-0.500 [")
+    of_both = ledger_table(results, TASK, "ppo + idle")
+    assert of_both.count("0.500 [") == 1  # with whichever is first
+
+
 def test_what_later_rules_of_an_agent_replaced_is_marked_and_left_out_of_short_tables():
     results = ledger(
         untrained("do-nothing", [0.1, 0.2]), untrained("planner", [0.7, 0.8]), untrained("planner", [0.6, 0.8], rules=2)

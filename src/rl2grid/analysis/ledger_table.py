@@ -99,19 +99,20 @@ def ledger_table(results: Mapping[str, HashedTest], task: str | None = None, ref
     Args:
         results: of a ledger.
         task: id of the task whose rows are shown; None: all.
-        reference: agent and heuristic, as in ``greedy + recovery``, that the rows of each task are compared with; None:
-            doing nothing.
+        reference: agent and heuristic, as in ``greedy + recovery``, that the rows of each task are compared with, and
+            what tells it from other rows, as in ``ppo + recovery (initial_log_std 0.0)``, if it is not to be the first
+            of them; None: doing nothing.
 
     Raises:
         UsageError: no row of the ledger has that name.
     """
     shown = {digest: one for digest, one in results.items() if task in (None, one.task)}
-    labels = sorted({one.label for one in shown.values()})
+    rows = ledger_rows(shown, results)
+    labels = sorted({label for row in rows for label in (row.first.label, row.label)})
     if reference is not None and reference not in labels:
         raise one_of("Reference", reference, labels)
     reference = reference or REFERENCE
     heading = f"to {reference}"
-    rows = ledger_rows(shown, results)
     compared = _compared(rows, reference)
     names = [name.format(heading=heading) for name in _HEADINGS]
     lines = [markdown_row(names), "|" + "---|" * len(names)]
@@ -226,7 +227,7 @@ def _compared(rows: Sequence[LedgerRow], reference: str) -> dict[int, Difference
     found: dict[int, Difference | str] = {}
     for _, group in itertools.groupby(enumerate(rows), key=lambda one: one[1].first.task):
         numbered = dict(group)
-        alike = [row for row in numbered.values() if row.first.label == reference]
+        alike = [row for row in numbered.values() if reference in (row.first.label, row.label)]
         base = min(alike, key=lambda row: row.is_outdated, default=None)
         if base is None:
             continue
