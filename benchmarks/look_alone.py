@@ -28,7 +28,7 @@ LEDGER, BEGINNINGS = RESULTS / "baselines.json", RESULTS / "look_alone.json"
 
 def beginning(task: str, heuristic: str | None, preset: str, seed: int, folder: Path) -> Path:
     """A policy before its first update; made once, or gone on with."""
-    run = folder / f"{task}-{heuristic}-{seed}"
+    run = folder / f"{task}-{heuristic}-{preset}-{seed}"
     usual = hyperparameters("sac", task, preset)
     changes = {"seed": seed, "total_timesteps": usual.num_envs * usual.num_steps}
     options = {"num_threads": 1, "progress": False, "heuristic": heuristic}
