@@ -81,6 +81,11 @@ class LedgerRow:
         """See :attr:`HashedTest.label`, and what tells it from others."""
         return f"{self.first.label}{self.told_by}"
 
+    @property
+    def names(self) -> tuple[str, str]:
+        """By which it is asked for: as its agent and heuristic are called, which other rows may be too, and wholly."""
+        return self.first.label, self.label
+
     def scores(self, column: str, months: int | None = None, *, of_last: bool = False) -> Scores:
         """A column of the tests, seeds of the training as runs; the first ``months`` of them."""
         tests = [one.last_by_month if of_last else one.by_month for one in self.results]
@@ -108,7 +113,7 @@ def ledger_table(results: Mapping[str, HashedTest], task: str | None = None, ref
     """
     shown = {digest: one for digest, one in results.items() if task in (None, one.task)}
     rows = ledger_rows(shown, results)
-    labels = sorted({label for row in rows for label in (row.first.label, row.label)})
+    labels = sorted({name for row in rows for name in row.names})
     if reference is not None and reference not in labels:
         raise one_of("Reference", reference, labels)
     reference = reference or REFERENCE
@@ -227,7 +232,7 @@ def _compared(rows: Sequence[LedgerRow], reference: str) -> dict[int, Difference
     found: dict[int, Difference | str] = {}
     for _, group in itertools.groupby(enumerate(rows), key=lambda one: one[1].first.task):
         numbered = dict(group)
-        alike = [row for row in numbered.values() if reference in (row.first.label, row.label)]
+        alike = [row for row in numbered.values() if reference in row.names]
         base = min(alike, key=lambda row: row.is_outdated, default=None)
         if base is None:
             continue
