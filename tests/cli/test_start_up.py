@@ -40,3 +40,10 @@ def test_help_and_tasks_are_shown_without_what_calculates(words: list[str]):
 
 def test_the_package_is_imported_without_what_calculates():
     assert imported("import rl2grid", HEAVY + NUMERICAL) == "[]"
+
+
+def test_evaluations_load_what_their_agent_needs_and_no_more():
+    """Every worker process of an evaluation imports the same, before it plays its first month."""
+    words = ["evaluate", "do-nothing", "bus14-T0", "--split", "bundled", "--months", "1", "--episode-length", "2"]
+    heavy = ("torch", "scipy.sparse", "scipy.optimize", "grid2op", "lightsim2grid", "matplotlib", "pandas")
+    assert imported(running(words), heavy) == "[]"

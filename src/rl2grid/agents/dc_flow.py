@@ -10,8 +10,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from rl2grid.arrays import F32, F64, I32
 from rl2grid.errors import UsageError
@@ -79,6 +77,9 @@ def buses(grid: Grid, busbar: I32) -> I32:
 
 def is_connected(grid: Grid, busbar: I32) -> bool:
     """Whether closed lines join all busbars that have an element."""
+    from scipy.sparse import coo_array  # slow to import, and few agents ask
+    from scipy.sparse.csgraph import connected_components
+
     bus = buses(grid, busbar)
     origin, extremity = bus[grid.line_or_pos_topo_vect], bus[grid.line_ex_pos_topo_vect]
     closed = (origin >= 0) & (extremity >= 0)

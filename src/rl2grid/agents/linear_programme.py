@@ -10,8 +10,6 @@ from contextlib import contextmanager
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import Bounds, LinearConstraint, milp
-from scipy.sparse import csr_array
 
 from rl2grid.arrays import F64
 
@@ -84,6 +82,9 @@ class Programme:
             time_limit: seconds that the solver may take.
             node_limit: nodes of the branch-and-bound tree that it may solve; None: any number.
         """
+        from scipy.optimize import Bounds, LinearConstraint, milp  # slow to import, and few agents solve anything
+        from scipy.sparse import csr_array
+
         shape = len(self._rows), len(self._cost)
         row, column, value = np.array(self._entries, np.float64).reshape(-1, 3).T
         matrix = csr_array((value, (row.astype(np.int32), column.astype(np.int32))), shape)

@@ -6,8 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from rl2grid.arrays import F32
 from rl2grid.mdp.state import GridState
@@ -50,6 +48,9 @@ def lost_elements(state: GridState, i: int) -> NDArray[np.bool_]:
 
     A storage unit or the end of a line may be off.
     """
+    from scipy.sparse import coo_array  # slow to import, and not needed where months are completed
+    from scipy.sparse.csgraph import connected_components
+
     topology, sub = state.final_topo_vect[i], state.element_to_subid
     n_sub = len(state.sub_info)
     busbar = np.where(topology > 0, sub + (topology - 1) * n_sub, -1)
