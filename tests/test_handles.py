@@ -15,8 +15,11 @@ from rl2grid.handles import AsOpened, Handle, opener
 from rl2grid.structures import allocate, blank_row, constant, copy_row, episode, row, scratch, workspace
 
 DTYPES = (
-    *("bool", "int32", "uint64", "float32", "float64"),
-    *(pytest.param(dtype, marks=pytest.mark.slow) for dtype in ("int8", "int64", "uint16", "uint32")),
+    *("bool", "int32", "float64"),
+    *(
+        pytest.param(dtype, marks=pytest.mark.slow)
+        for dtype in ("int8", "int64", "uint16", "uint32", "uint64", "float32")
+    ),
 )
 SIZES = {"a": 5, "b": 3, "c": 4}
 

@@ -87,6 +87,7 @@ def test_where_power_is_dispatched_the_planner_is_told_what_comes(task, first_is
     assert all(isinstance(attempt, _Telling) for attempt in attempts) is (task == "bus14-R")
 
 
+@pytest.mark.slow
 def test_redispatching_it_outlives_nobody_by_less():
     bound, alone = survived(Foresight(ahead=48), "bus14-R"), survived(Planner(), "bus14-R")
     assert bound.grid_steps >= alone.grid_steps

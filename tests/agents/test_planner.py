@@ -63,13 +63,13 @@ class Nothing:
         return self._action
 
 
-@pytest.mark.parametrize("task", ["bus36-MO-v0-T0", "bus36-MO-v0-H0"])
+@pytest.mark.parametrize("task", ["bus36-MO-v0-T0", pytest.param("bus36-MO-v0-H0", marks=pytest.mark.slow)])
 def test_survives_attacks_that_end_doing_nothing(task):
     nothing = play(Nothing(), environment(task), seed=3)[1]
     assert play(Planner(), environment(task), seed=3)[1] > 1.5 * nothing
 
 
-@pytest.mark.parametrize("task", ["bus14-T0", "bus118-M-H0"])
+@pytest.mark.parametrize("task", ["bus14-T0", pytest.param("bus118-M-H0", marks=pytest.mark.slow)])
 def test_survives_what_doing_nothing_survives(task):
     nothing = play(Nothing(), environment(task))[1]
     assert play(Planner(), environment(task))[1] >= nothing

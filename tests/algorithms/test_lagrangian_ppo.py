@@ -528,6 +528,7 @@ def test_the_best_policy_of_a_constrained_chain_is_found():
     assert price[0] == pytest.approx(0.5, abs=0.03)
 
 
+@pytest.mark.slow
 def test_several_constraints_are_met_each_at_its_own_price():
     """Thresholds 0.3 and 0.6 for the risks of the two states one by one, which pay 1 and 0.5."""
     risk, price = trained_on_chain(constraints=("first", "second"), thresholds=(0.3, 0.6))
@@ -535,6 +536,7 @@ def test_several_constraints_are_met_each_at_its_own_price():
     assert price.tolist() == pytest.approx([1.0, 0.5], abs=0.1)
 
 
+@pytest.mark.slow
 def test_a_threshold_that_is_never_reached_changes_nothing_in_the_end():
     risk, price = trained_on_chain(thresholds=(5.0,), initial_multiplier=2.0)
     assert price[0] == 0.0
@@ -571,6 +573,7 @@ def pulled(threshold: float) -> tuple[float, float, float]:
     return float(np.mean(costs[-40:])), float(actions.clamp(min=0.0).mean()), -float(regret)
 
 
+@pytest.mark.slow
 def test_continuous_actions_meet_a_constraint():
     """On average over observations x in [-1, 1], the best action, 0.2 + 0.5 x, costs 0.245 of effort.
 

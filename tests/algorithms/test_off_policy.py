@@ -374,7 +374,7 @@ def test_a_resumed_run_ends_with_the_weights_of_one_that_was_not_interrupted(
     changes = {"buffer_size": 150, "last_learning_rate_share": 0.1, "lag": lag}  # forgets on the way
     straight = trainer(kind, **changes)
     metrics = [straight.iterate() for _ in range(straight.num_iterations)][-1]
-    for stop in (1, 3, 5):
+    for stop in (1, 4):
         begun = trainer(kind, **changes)
         if in_files:
             begun.store_in(tmp_path / f"replay{stop}")

@@ -728,6 +728,7 @@ def cartpole_args(seed: int) -> Args:
     )
 
 
+@pytest.mark.slow
 def test_cartpole_is_learned():
     ppo = PPO(cartpole_args(2), cartpole(8))
     while not ppo.finished:
@@ -746,7 +747,7 @@ def test_cartpole_is_learned():
     assert lengths.mean() > 400
 
 
-@BOTH
+@pytest.mark.parametrize("continuous", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_the_toy_grid_is_kept_alive(continuous: bool):
     """Survival rises to nearly always, masks, game overs, completions and long transitions included."""
     args = replace(

@@ -403,12 +403,14 @@ def test_the_soft_optimum_of_discrete_actions_is_found():
     np.testing.assert_allclose(probabilities, torch.softmax(torch.tensor([0.0, 1.0, 2.0]), 0), atol=0.03)
 
 
+@pytest.mark.slow
 def test_the_temperature_brings_the_entropy_to_its_target():
     args = replace(LEARNING, first_entropy_share=0.7, last_entropy_share=0.7)
     _, metrics = run(replace(args, temperature_learning_rate=1e-2), vector(Arms, 8))
     assert np.mean([m["losses/entropy"] for m in metrics[-4:]]) == pytest.approx(0.7 * math.log(3), abs=0.06)
 
 
+@pytest.mark.slow
 def test_the_best_continuous_action_is_found():
     sac, metrics = run(LEARNING, vector(Follow, 8))
     shown = torch.linspace(-0.7, 0.7, 15).unsqueeze(-1)

@@ -36,7 +36,7 @@ from rl2grid.engines.dispatch import (
 from rl2grid.engines.reference.dispatch import ExactRedispatchSolver
 from rl2grid.grids import GRID_IDS, load_grid
 
-RECORDED_STEPS = 60
+RECORDED_STEPS = 30
 RANDOM_PROBLEMS = 3000
 FLOAT32_ROUNDING = 5e-5  # MW, of a dispatch of some hundred MW
 

@@ -321,7 +321,10 @@ def test_unknown_probes_are_refused():
         make_probe(load_grid("bus14"), "topology", "evil")
 
 
-@pytest.mark.parametrize("heuristic", ["recovery", "careful", "secure"])
+@pytest.mark.parametrize(
+    "heuristic",
+    [pytest.param("recovery", marks=pytest.mark.slow), "careful", pytest.param("secure", marks=pytest.mark.slow)],
+)
 def test_transitions_are_compared_and_a_heuristic_that_differs_is_found(heuristic):
     reference, native = engines("bus36-MO-v0", "exact")
 

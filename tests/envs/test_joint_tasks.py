@@ -160,10 +160,10 @@ def test_what_is_no_action_is_refused_in_a_sentence(action, sentence):
             ask(action)
 
 
-VECTORS: list[dict[str, Any]] = [
+VECTORS: list[Any] = [
     {"engine": "native"},
     {"engine": "reference", "num_workers": 0},
-    {"engine": "reference", "num_workers": 2},
+    pytest.param({"engine": "reference", "num_workers": 2}, marks=pytest.mark.slow),
 ]
 
 

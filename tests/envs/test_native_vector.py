@@ -125,7 +125,7 @@ def assert_close(mine: Any, theirs: Any, where: str = "") -> None:
 @pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize("heuristic", HEURISTICS)
 def test_equals_the_reference_engine(task, heuristic):
-    seeds, decisions = [11, 12], 40 if heuristic is None else 8
+    seeds, decisions = [13, 26], 40 if heuristic is None else 8  # their heuristics have little to wait for
     keywords = {"heuristic": heuristic, "gamma": 0.99}
     reference = make_vector(task, len(seeds), engine="reference", num_workers=0, **keywords)
     native = make_vector(task, len(seeds), **keywords)

@@ -102,6 +102,7 @@ for more in ({}, {"engine": "reference", "num_workers": 1}):
 """
 
 
+@pytest.mark.slow
 def test_worker_processes_are_asked_and_know_a_reward_of_the_script(tmp_path: Path):
     """In a script of its own, whose functions no other process can import."""
     (tmp_path / "script.py").write_text(SCRIPT)

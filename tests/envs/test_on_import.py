@@ -55,6 +55,7 @@ def test_without_gymnasium_the_package_is_imported():
     assert run("-c", code) == rl2grid.__version__
 
 
+@pytest.mark.slow
 def test_workers_know_the_tasks(tmp_path: Path):
     script = tmp_path / "workers.py"
     script.write_text(WORKERS)

@@ -70,6 +70,7 @@ def test_it_plays_as_the_grid_that_it_is_a_copy_of(mine):
         assert one[1:4] == other[1:4]
 
 
+@pytest.mark.slow
 def test_workers_of_a_vector_know_it(mine):
     vector = gymnasium.make_vec("rl2grid/mine-R-v0", num_envs=2, engine="reference", num_workers=1)
     observations, infos = vector.reset(seed=0)

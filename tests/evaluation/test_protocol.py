@@ -449,7 +449,7 @@ def test_a_checkpoint_plays_as_it_was_trained(checkpoint, tmp_path):
     assert remote.identity == alone.identity
 
 
-@pytest.mark.parametrize("workers", [0, 1])
+@pytest.mark.parametrize("workers", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_the_policy_played_is_the_one_whose_hash_is_stored(checkpoint, tmp_path, monkeypatch, workers):
     """A run that still trains replaces its file at any moment, this one between the identity and the first episode."""
     path = tmp_path / "best.pt"

@@ -29,8 +29,8 @@ def test_bundled_plans_are_playable_and_reproducible() -> None:
 
 
 def test_seeds_and_numbers_differ() -> None:
-    plans = {(plan_episode(BUS14, "train", seed, number).start) for seed in range(5) for number in range(5)}
-    assert len(plans) >= 24
+    plans = {(plan_episode(BUS14, "train", seed, number).start) for seed in range(3) for number in range(3)}
+    assert len(plans) == 9
 
 
 def test_training_samples_rows_uniformly() -> None:
@@ -177,7 +177,7 @@ def test_only_drawn_starts_of_generated_months_are_drawn_again(monkeypatch) -> N
 
 
 def test_an_episode_of_a_given_length_fits_where_it_starts() -> None:
-    for seed in range(20):
+    for seed in range(5):
         default, week = (plan_episode(BUS14, "train", seed, 1, episode_length=length) for length in (None, 2016))
         assert week == default._replace(n_steps=2016)
     assert plan_episode(BUS14, "bundled", 0, 0, episode_length=575).n_steps == 575

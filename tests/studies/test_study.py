@@ -221,6 +221,7 @@ def test_a_pupil_is_labelled_for_in_rounds_and_goes_on_after_an_interruption(tmp
     assert [line.split()[1] for line in words] == ["teach", "train", "teach", "train", "evaluate"]
 
 
+@pytest.mark.slow
 def test_an_algorithm_goes_on_from_the_last_pupil(tmp_path: Path):
     group = {
         **TAUGHT,

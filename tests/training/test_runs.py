@@ -332,6 +332,7 @@ def test_a_run_killed_at_the_worst_moments_ends_like_one_that_was_not(tmp_path: 
     assert_same_run(tmp_path / "run", straight)
 
 
+@pytest.mark.slow
 def test_a_run_killed_at_random_moments_ends_like_one_that_was_not(tmp_path: Path):
     straight = train(request(tmp_path / "straight"), evaluate=falling, make_envs=toy_envs)
     for attempt in range(2):
@@ -349,7 +350,7 @@ def test_a_run_killed_at_random_moments_ends_like_one_that_was_not(tmp_path: Pat
     ("task", "engine", "sizes"),
     [
         ("bus14-T0", "native", {"num_envs": 20, "num_steps": 8}),
-        ("bus14-R", "native", {"num_envs": 20, "num_steps": 8}),
+        pytest.param("bus14-R", "native", {"num_envs": 20, "num_steps": 8}, marks=pytest.mark.slow),
         ("bus14-T0", "reference", {"num_envs": 2, "num_steps": 2}),
     ],
 )
