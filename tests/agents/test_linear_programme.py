@@ -4,21 +4,21 @@ import ctypes
 
 import numpy as np
 import pytest
+import scipy.optimize
 
-from rl2grid.agents import linear_programme
 from rl2grid.agents.linear_programme import Affine, Programme
 
 
 @pytest.mark.parametrize("limit", [None, 7])
 def test_the_node_limit_reaches_the_solver(limit, monkeypatch):
     given = {}
-    solve = linear_programme.milp
+    solve = scipy.optimize.milp
 
     def spy(*arguments, **keywords):
         given.update(keywords["options"])
         return solve(*arguments, **keywords)
 
-    monkeypatch.setattr(linear_programme, "milp", spy)
+    monkeypatch.setattr(scipy.optimize, "milp", spy)
     programme = Programme()
     cost = programme.column(0.0, 10.0, cost=1.0)
     chosen = programme.binary()
@@ -30,13 +30,13 @@ def test_the_node_limit_reaches_the_solver(limit, monkeypatch):
 
 def test_what_compiled_code_prints_is_dropped_while_solving_only(monkeypatch, capfd):
     library = ctypes.CDLL(None)
-    solve = linear_programme.milp
+    solve = scipy.optimize.milp
 
     def chatty(*arguments, **keywords):
         library.puts(b"stray line")
         return solve(*arguments, **keywords)
 
-    monkeypatch.setattr(linear_programme, "milp", chatty)
+    monkeypatch.setattr(scipy.optimize, "milp", chatty)
     programme = Programme()
     programme.column(1.0, 2.0, cost=1.0)
     library.puts(b"before")
