@@ -16,6 +16,7 @@ from importlib import import_module
 from typing import Any, NoReturn
 
 from rl2grid import __version__
+from rl2grid.cli.complaints import in_words
 from rl2grid.cli.output import Output
 from rl2grid.errors import DamageWarning, UsageError
 from rl2grid.records.files import printable
@@ -69,7 +70,8 @@ class Parser(argparse.ArgumentParser):
         return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
-        raise UsageError(f"{message[0].upper()}{message[1:]}; see {self.prog} --help.")
+        words = in_words(message)
+        raise UsageError(f"{words[0].upper()}{words[1:]}; see {self.prog} --help.")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 from rl2grid.algorithms.registry import algorithm_names
+from rl2grid.cli.complaints import in_words
 from rl2grid.cli.keywords import flag_text, reward_of
 from rl2grid.cli.main import INTERRUPTED
 from rl2grid.cli.output import Output
@@ -262,7 +263,7 @@ def _parse(program: str, flags: list[str], default: Any) -> Any:
     except SystemExit as stop:
         if not stop.code:
             raise  # --help was asked for
-        raise UsageError(f"{_sentence(complaint.getvalue())}; see {program} --help.") from None
+        raise UsageError(f"{in_words(_sentence(complaint.getvalue()))}; see {program} --help.") from None
 
 
 def _sentence(box: str) -> str:
