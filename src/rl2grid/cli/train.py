@@ -44,7 +44,7 @@ class TrainFlags:
     """How the run is made; the environment's keywords and the algorithm's hyperparameters are flags as well."""
 
     preset: str = "default"
-    """Hyperparameters to start from: ``default``, ``paper``, or ``tuned`` (SAC with discrete, PPO with continuous
+    """Hyperparameters to start from: ``default``, ``paper``, or ``tuned`` (SAC, and PPO with continuous
     actions); single flags replace single values."""
     output: Path | None = None
     """Run folder, which must not exist yet; None: runs/<task>-<algorithm>-<seed>."""
