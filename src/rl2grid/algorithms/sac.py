@@ -173,8 +173,8 @@ def tuned(*, continuous: bool) -> Args:
     decisions each, rates rounded: longer trainings and other grids may want other values.
 
     Continuous: trials on bus36-M-R with ``recovery``, compared with the default on other seeds and months
-    (``benchmarks/families.py``). A temperature of 0.1, with which the default begins, pays a decision more for its
-    entropy than any month pays.
+    (``benchmarks/families.py``). The temperature of 0.1 with which the default begins pays a decision as much for its
+    entropy as all that follows it is worth.
     """
     if continuous:
         return replace(
