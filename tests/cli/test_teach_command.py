@@ -72,7 +72,7 @@ def test_an_interrupt_tells_how_it_goes_on(capsys: pytest.CaptureFixture[str], t
         (["greedy", "bus15-T0"], "Task 'bus15-T0' does not exist"),
         (["greedy"], "The following arguments are required: task"),
         (["greedy", "bus14-T0", "--months", "0"], "months=0 is not allowed"),
-        (["greedy", "bus14-T0", "--months", "many"], "Argument --months: invalid int value: 'many'"),
+        (["greedy", "bus14-T0", "--months", "many"], "--months takes a whole number, not 'many'"),
         (["greedy", "bus14-T0", "--split", "test"], "Unrecognized arguments: --split test"),
         (["greedy", "bus14-T0", "--thin", "0"], "thin=0.0 is not allowed"),
         (["greedy", "bus14-T0", "--gamma", "2"], "gamma=2.0 is not allowed"),
