@@ -15,7 +15,7 @@ export NO_MKDOCS_2_WARNING := 1
 
 help:
 	@echo "make demo       train DQN on bus14, evaluate it, write reports/demo (a few minutes)"
-	@echo "make test       linters, types, layers and the tests (ten minutes on two cores the first time, which compiles)"
+	@echo "make test       linters, types, layers and the tests (eight minutes on two cores; thirteen the first time, which compiles)"
 	@echo "make test-slow  the longer tests too, the site and the code blocks of the documentation among them"
 	@echo "make docs       build the documentation into site/ (half a minute), to be opened as site/index.html"
 	@echo "make release    tests, builds and tries out the packages, and stops before the upload"
