@@ -1,7 +1,7 @@
 """Everything that a release takes, up to the upload, which is left to a person: ``make release``.
 
 1. The working copy is that of a commit, and the version is the same wherever it stands.
-2. ``make test``.
+2. ``make test``, then ``make docs``: the tests build no site.
 3. Wheel and source distribution are built into ``dist/``.
 4. Each is installed into an environment of its own, with the versions of ``constraints.txt``, and tried from another
    folder with an empty data folder and no compiler within reach: commands, an evaluation, a training, its evaluation.
@@ -37,6 +37,7 @@ def main() -> int:
     version = checked_version()
     check_committed()
     run("make test", ROOT)
+    run("make docs", ROOT)
     built = build(version)
     for package in built:
         print(f"== Trying {package.name} in an environment of its own", flush=True)
