@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rl2grid.arrays import F32, F64, I32
 from rl2grid.errors import UsageError
@@ -77,16 +78,26 @@ def buses(grid: Grid, busbar: I32) -> I32:
 
 def is_connected(grid: Grid, busbar: I32) -> bool:
     """Whether closed lines join all busbars that have an element."""
-    from scipy.sparse import coo_array  # slow to import, and few agents ask
+    bus = buses(grid, busbar)
+    part = connected_parts(bus[grid.line_or_pos_topo_vect], bus[grid.line_ex_pos_topo_vect], 2 * grid.n_sub)
+    return len(np.unique(part[bus[bus >= 0]])) == 1
+
+
+def connected_parts(origin: NDArray[np.integer], extremity: NDArray[np.integer], n_buses: int) -> I32:
+    """Which part of the grid each bus is in, int32 [bus]: closed lines join those of a part.
+
+    Args:
+        origin: bus at the origin of each line, [line]; -1 for an end that is off, whose line is open.
+        extremity: the same at its extremity.
+        n_buses: how many buses there are.
+    """
+    from scipy.sparse import coo_array  # slow to import, and seldom needed: after a game over, and by few agents
     from scipy.sparse.csgraph import connected_components
 
-    bus = buses(grid, busbar)
-    origin, extremity = bus[grid.line_or_pos_topo_vect], bus[grid.line_ex_pos_topo_vect]
     closed = (origin >= 0) & (extremity >= 0)
-    ends = (origin[closed], extremity[closed])
-    links = coo_array((np.ones(len(ends[0])), ends), shape=(2 * grid.n_sub, 2 * grid.n_sub))
-    _, part = connected_components(links, directed=False)
-    return len(np.unique(part[bus[bus >= 0]])) == 1
+    links = coo_array((np.ones(closed.sum()), (origin[closed], extremity[closed])), shape=(n_buses, n_buses))
+    part: I32 = connected_components(links, directed=False)[1]
+    return part
 
 
 def sensitivities(grid: Grid, point: DcPoint) -> F64:

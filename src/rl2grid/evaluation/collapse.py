@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rl2grid.agents.dc_flow import connected_parts
 from rl2grid.arrays import F32
 from rl2grid.mdp.state import GridState
 
@@ -48,16 +49,10 @@ def lost_elements(state: GridState, i: int) -> NDArray[np.bool_]:
 
     A storage unit or the end of a line may be off.
     """
-    from scipy.sparse import coo_array  # slow to import, and not needed where months are completed
-    from scipy.sparse.csgraph import connected_components
-
     topology, sub = state.final_topo_vect[i], state.element_to_subid
     n_sub = len(state.sub_info)
     busbar = np.where(topology > 0, sub + (topology - 1) * n_sub, -1)
-    ends = np.stack((busbar[state.line_or_pos_topo_vect], busbar[state.line_ex_pos_topo_vect]))
-    ends = ends[:, (ends >= 0).all(axis=0)]
-    links = coo_array((np.ones(ends.shape[1]), ends), shape=(2 * n_sub, 2 * n_sub))
-    _, piece = connected_components(links, directed=False)
+    piece = connected_parts(busbar[state.line_or_pos_topo_vect], busbar[state.line_ex_pos_topo_vect], 2 * n_sub)
     balancing = busbar[state.gen_pos_topo_vect[state.slack_gen[0]]]
     apart = np.ones(len(topology), np.bool_) if balancing < 0 else piece[busbar] != piece[balancing]
     vital = np.zeros(len(topology), np.bool_)
