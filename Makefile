@@ -17,7 +17,7 @@ help:
 	@echo "make demo       train DQN on bus14, evaluate it, write reports/demo (a few minutes)"
 	@echo "make test       linters, types, layers and the tests (eight minutes on two cores; thirteen the first time, which compiles)"
 	@echo "make test-slow  the longer tests too, the site and the code blocks of the documentation among them"
-	@echo "make docs       build the documentation into site/ (half a minute), to be opened as site/index.html"
+	@echo "make docs       build the documentation into site/ (a minute), to be opened as site/index.html"
 	@echo "make release    tests, builds the site and the packages, tries these out, and stops before the upload"
 	@echo "make clean      remove the virtual environment and what was made"
 

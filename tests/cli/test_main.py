@@ -96,7 +96,7 @@ def test_tasks_of_one_grid(capsys):
         (["train", "ppo", "bus14-T0", "--seed", "x"], "rl2grid: --seed takes a whole number, not 'x'; see"),
         (
             ["train", "ppo", "bus14-T0", "--decisions", "1e5"],
-            "--decisions takes a whole number, not '1e5'; see",
+            "rl2grid: --decisions takes a whole number, not '1e5'; see",
         ),
         (["train", "ppo", "bus14-T0", "--threads", "x"], "rl2grid: --threads takes a whole number, not 'x'; see"),
         (["train", "ppo", "bus14-T0", "--gamma", "a"], "rl2grid: --gamma takes a number, not 'a'; see"),

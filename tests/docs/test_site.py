@@ -8,7 +8,7 @@ pytest.importorskip("mkdocs")
 
 from rl2grid.envs.options import OPTION_NAMES
 
-pytestmark = pytest.mark.slow  # a strict build takes half a minute; `make docs` makes one too
+pytestmark = pytest.mark.slow  # a strict build takes a minute; `make docs` makes one too
 FETCHED = re.compile(r"""<(?:script|link|img)\b[^>]*?(?:src|href)=["']?(https?:[^"'\s>]+)""")
 
 

@@ -94,7 +94,12 @@ def test_groups_come_in_the_order_of_the_table_whatever_the_order_asked_for() ->
 
 @pytest.mark.parametrize(
     ("heuristic", "engine", "workers"),
-    [(None, "native", None), ("secure", "native", None), ("secure", "reference", 0)],
+    [
+        (None, "native", None),
+        ("secure", "native", None),
+        pytest.param(None, "reference", 1, marks=pytest.mark.slow),
+        ("secure", "reference", 0),
+    ],
 )
 def test_a_vector_tells_what_single_environments_tell(heuristic: str | None, engine: str, workers: int | None) -> None:
     keywords = {"heuristic": heuristic, "operator_features": "all", "engine": engine}
